@@ -12,11 +12,11 @@ import shlex
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from jtqd import __version__
 from jtqd.estimator.command_line import check_installed, command_parser, make_directory
@@ -87,15 +87,13 @@ def _main(argv: list[str]) -> int:
     try:
         columns = None if options.columns is None else ColumnMap.load(options.columns)
         files = joint_files(options.joint, columns)
-        asked = asked_effects(options.without, options.given)
         check_installed("analysis", *_NEEDED)
         check_joint_files(files)
         _check_out(options.out, options.force, [*options.runs, *files.values()])
         runs = read_runs(options.runs, columns, segments=True, joints=named_joints(files))
         joints = joints_of(files, runs)
         known = () if columns is None else columns.known_loads
-        scope = scope_of(asked, joints, known)
-        trust = trusted(options.trust)
+        scope, trust = scope_of(options.without, options.given, joints, known), dict(options.trust)
         for run in runs:
             for note in run.notes:
                 print(f"{BY}: {run.name}: {note}", file=sys.stderr)
@@ -104,11 +102,11 @@ def _main(argv: list[str]) -> int:
         findings = replace(
             findings,
             joint_files=joints,
-            next_experiment=_next_experiment(findings.next_experiment, options, joints),
             relevance=options.relevance,
             trust=trust,
             provenance=_provenance(argv, runs, files, options.columns),
         )
+        findings = replace(findings, next_experiment=_next_experiment(findings, options))
         mapping = _write(options.out, findings, joints, {run.name: run.sha256 for run in runs})
     except UsageError as error:
         print(f"{BY}: {error}", file=sys.stderr)
@@ -147,35 +145,23 @@ def _provenance(
     return Provenance(dt.datetime.now().astimezone().date().isoformat(), __version__, command, inputs)
 
 
-def _next_experiment(
-    experiment: Mapping[str, Any] | None, options: argparse.Namespace, joints: Mapping[int, Joint]
-) -> dict[str, Any] | None:
-    """Return the next experiment with the command that runs its plan (nothing of ours runs the motion of an arm), and with a
-    sentence where it goes further than --limits, or --limits than the joint files.
+def _next_experiment(findings: Findings, options: argparse.Namespace) -> dict[str, Any] | None:
+    """Return the next experiment with the command that runs its plan, and what it does not keep of --limits, or --limits of
+    the joint files.
     """
-    if experiment is None:
+    if findings.next_experiment is None:
         return None
-    from jtqd.sysid.diagnosis.next_experiment import CONFIG, PLAN_FILE, campaign_command
+    from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE
 
-    made, towing = dict(experiment), bool(experiment.get("plan"))
-    if towing:
-        from jtqd.sysid.campaign.bench import BenchConfig
-
-        config = "" if BenchConfig.load(None).may_have(joints) else CONFIG
-        if options.config is not None:
-            config = shlex.quote(str(options.config))
-        plan = shlex.quote(str(options.out / PLAN_FILE))
-        made["command"] = campaign_command(plan, shlex.quote(options.bus), config)
-    notes = []
-    for number, joint in joints.items():
-        wider = beyond_file(joint, options.limits)
-        if wider:
+    made, notes = dict(findings.next_experiment), []
+    for number, joint in findings.joint_files.items():
+        if wider := beyond_file(joint, options.limits):
             notes.append(f"--limits allows more than motion_limits of joint {number}: {wider}.")
-    if towing and "travel_rad" in (options.limits or {}):
-        notes.append(
-            "travel_rad of --limits is not kept: two joints on one sensor are taken for a towing bench, whose coupling "
-            "turns freely; that of the plan's own limits is."
-        )
+    if made.get("plan"):
+        plan = shlex.quote(str(options.out / PLAN_FILE))
+        made["command"] = f"jtq campaign {plan} --bus can0 --config CONFIG --out RUNS"
+        if "travel_rad" in (options.limits or {}):
+            notes.append("A towing bench turns freely: travel_rad of --limits is not kept.")
     made["why"] = " ".join([made["why"], *notes])
     return made
 
@@ -244,21 +230,30 @@ def parser() -> argparse.ArgumentParser:
     )
     option("--out", "DIR", "output directory; created if missing", type=Path, required=True)
     add_columns(parser)
-    option("--without", "[N=]EFFECT", "an effect that is absent (of joint N, or sensor=EFFECT)", **again)
-    option("--given", "[N=]EFFECT", "an effect that is as the joint file has it: not questioned", **again)
+    option(
+        "--without",
+        "[N=]EFFECT",
+        "an effect that is absent (of joint N, or sensor=EFFECT)",
+        type=effect_at,
+        **again,
+    )
+    option(
+        "--given",
+        "[N=]EFFECT",
+        "an effect that is as the joint file has it: not questioned",
+        type=effect_at,
+        **again,
+    )
     trust = (
         "how far a value may be off, one standard deviation, in the unit of its prior: sensor_gain=5%%, "
         "channel_delay=5ms (defaults: priors in the report)"
     )
-    option("--trust", "NAME=SIZE", trust, **again)
+    option("--trust", "NAME=SIZE", trust, type=trusted, **again)
     limits = (
         "where the next experiment may move: travel_rad=LOW:HIGH, velocity_rad_s, acceleration_rad_s2, torque_nm "
         "(default: motion_limits of the joint file); never beyond what the runs did"
     )
     option("--limits", "NAME=VALUE,...", limits, type=motion_limits)
-    config = "configuration of jtqd for the printed command (default: CONFIG, to be replaced; none for the shipped bench)"
-    option("--config", "FILE", config, type=Path)
-    option("--bus", "BUS", "bus for the printed command (default can0)", default="can0")
     relevance = "of the rated torque, rms: entries and what remains matter from here on (default 0.5)"
     option("--relevance", "PERCENT", relevance, type=_percent, default=RELEVANCE)
     force = "replace the results of an earlier diagnosis in DIR"
@@ -267,89 +262,64 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-# What the user knows: items [WHERE=]EFFECT of --without and --given, WHERE a joint or "sensor"; items PRIOR=SIZE of --trust.
+Where = tuple[JointName | None, str]
+"""Joint, "sensor" or None (wherever it may be), and effect."""
 
 
-class Asked(NamedTuple):
-    """An item of --without or --given: option, as it was written, where (None: wherever it may be), effect."""
+def effect_at(text: str) -> Where:
+    """Return what an item [WHERE=]EFFECT of --without or --given is of. Raises argparse.ArgumentTypeError."""
+    match = _ITEM.fullmatch(text)
+    if match is None or match["name"] not in EFFECTS:
+        raise argparse.ArgumentTypeError(
+            f"{text}: found no effect of that name, expected NAME, N=NAME or sensor=NAME of {', '.join(sorted(EFFECTS))}"
+        )
+    where = match["where"]
+    return where if where in (None, SENSOR) else int(where), match["name"]
 
-    option: str
-    text: str
-    where: JointName | None
-    name: str
 
+def scope_of(
+    without: Collection[Where],
+    given: Collection[Where],
+    joints: Mapping[int, Joint],
+    known: Iterable[int] = (),
+) -> Scope:
+    """Return what is not looked for: effects that are absent, and effects that are as the joint files have them, in
+    `effects` or as one of their values. known: joints whose torque is known.
 
-def asked_effects(without: Iterable[str], given: Iterable[str]) -> list[Asked]:
-    """Return the items of --without (the effect is taken to be absent) and --given (it is as the joint files have it, in
-    `effects` or as one of their values, which is then not questioned).
-
-    Raises UsageError for a name that is no effect, and for an effect that is both.
+    Raises UsageError for a joint that there is not, and for a given effect that no joint file has: it would be absent.
     """
-    found: list[Asked] = []
-    for option, text in (*(("--without", text) for text in without), *(("--given", text) for text in given)):
-        match = _ITEM.fullmatch(text)
-        if match is None or match["name"] not in EFFECTS:
-            raise UsageError(
-                f"{option} {text}: found no effect of that name, expected NAME, N=NAME or sensor=NAME of "
-                f"{', '.join(sorted(EFFECTS))}"
-            )
-        where = match["where"]
-        new = Asked(option, text, where if where in (None, SENSOR) else int(where), match["name"])
-        for old in found:
-            same = old.name == new.name and (old.where == new.where or None in (old.where, new.where))
-            if same and old.option != option:
-                raise UsageError(
-                    f"{old.option} {old.text}: found it beside {option} {text}, expected one of them"
-                )
-        found.append(new)
-    return found
-
-
-def scope_of(asked: Iterable[Asked], joints: Mapping[int, Joint], known: Iterable[int] = ()) -> Scope:
-    """Return the scope that options ask for; known: joints whose torque is known. Raises UsageError for a joint that there
-    is not, and for a given effect that no joint file has: taken as given it would be --without.
-    """
-    out = set()
-    for option, text, where, name in asked:
+    for where, name in (*without, *given):
         if where is not None and where != SENSOR and where not in joints:
             have = ", ".join(str(number) for number in sorted(joints))
-            raise UsageError(f"{option} {text}: found no joint {where} in runs and joint files: {have}")
-        files = [joint for number, joint in joints.items() if where in (None, SENSOR, number)]
-        in_file = any(effect.name == name for joint in files for effect in joint.effects)
-        has_key = any(parameter.key for parameter in EFFECTS[name].parameters)
-        if option == "--given" and not in_file and not has_key:
+            raise UsageError(f"{where}={name}: found no joint {where} in runs and joint files: {have}")
+    for where, name in given:
+        of = [joint for n, joint in joints.items() if where in (None, SENSOR, n)]
+        listed = any(effect.name == name for joint in of for effect in joint.effects)
+        if not listed and not any(p.key for p in EFFECTS[name].parameters):
             raise UsageError(
-                f"--given {text}: found no effect {name} in {' or '.join(joint.name for joint in files)}, expected it under "
-                f"`effects` with its parameters (or --without {text} for an effect that is absent)"
+                f"--given {name}: found it neither among the effects of a joint file nor as one of its values, expected "
+                f"it there, or --without {name}"
             )
-        out.add((where, name))
-    return Scope(frozenset(out), frozenset(known))
+    return Scope(frozenset((*without, *given)), frozenset(known))
 
 
-def trusted(items: Iterable[str]) -> dict[str, float]:
-    """Return the factor on the size of a prior that option --trust asks for, by the prior's name (`limits.PRIORS`).
+def trusted(text: str) -> tuple[str, float]:
+    """Return the name of a prior (`limits.PRIORS`) and the factor on its size that an item NAME=SIZE of --trust asks for.
 
-    Items are "NAME=SIZE": how far a value may be off, as a standard deviation, in the unit of the prior ("sensor_gain=5%":
-    five times the default of 1 %; "channel_delay=5ms"). Raises UsageError.
+    SIZE: how far a value may be off, as a standard deviation, in the unit of the prior ("sensor_gain=5%": five times the
+    default of 1 %; "channel_delay=5ms"). Raises argparse.ArgumentTypeError.
     """
-    found: dict[str, float] = {}
-    for text in items:
-        name, _, asked = text.partition("=")
-        if name not in PRIORS:
-            raise UsageError(
-                f"--trust {text}: found {name!r}, expected NAME=SIZE with one of {', '.join(sorted(PRIORS))}"
-            )
-        if name in found:
-            raise UsageError(f"--trust {text}: found {name} twice, expected one size")
-        default, size = _SIZE.match(PRIORS[name].text), _SIZE.fullmatch(asked.strip())
-        assert default is not None, f"the prior of {name} has no size in a unit"
-        if size is None or not 0.0 < float(size[1]) < math.inf or size[2] != default[2]:
-            raise UsageError(
-                f"--trust {text}: found {asked!r}, expected a number above 0 with the unit {default[2]} (default "
-                f"{PRIORS[name].text})"
-            )
-        found[name] = float(size[1]) / float(default[1])
-    return found
+    name, _, asked = text.partition("=")
+    if name not in PRIORS:
+        names = ", ".join(sorted(PRIORS))
+        raise argparse.ArgumentTypeError(f"found {name!r}, expected NAME=SIZE with one of {names}")
+    default, size = _SIZE.match(PRIORS[name].text), _SIZE.fullmatch(asked.strip())
+    assert default is not None, f"the prior of {name} has no size in a unit"
+    if size is None or not 0.0 < float(size[1]) < math.inf or size[2] != default[2]:
+        raise argparse.ArgumentTypeError(
+            f"{name}: found {asked!r}, expected a number above 0 with the unit {default[2]} (default {PRIORS[name].text})"
+        )
+    return name, float(size[1]) / float(default[1])
 
 
 def motion_limits(text: str) -> dict[str, Any]:
@@ -445,17 +415,6 @@ def extended(joint: Joint, number: int, findings: Findings, *, sha256: Mapping[s
     return with_effects_applied(whole)
 
 
-def extended_files(joints: Mapping[int, Joint], findings: Findings) -> dict[str, int]:
-    """Return names of the files to write and the joint that each holds.
-
-    extended.joint.yaml is the joint of the largest cause (a cause of the sensor is in every file, so the next one
-    decides; then the joint of the largest gap, then the first). With more joints than one each has its own file as well.
-    """
-    largest_first = [*(c.joint for c in findings.causes), *(g.joint for g in findings.gaps), *sorted(joints)]
-    first = next(int(number) for number in largest_first if number in joints)
-    return {EXTENDED: first} | {f"extended.joint{n}.yaml": n for n in sorted(joints) if len(joints) > 1}
-
-
 def extended_title(number: int, findings: Findings) -> str:
     """First line of an extended joint file."""
     names = [cause.name for cause in findings.causes if shows_at(cause.joint, number)]
@@ -466,15 +425,15 @@ def extended_title(number: int, findings: Findings) -> str:
 def write_extended(
     directory: Path, joints: Mapping[int, Joint], findings: Findings, **origin: Any
 ) -> list[str]:
-    """Write all extended joint files into `directory`, each whole or not at all; returns their names.
+    """Write the extended file of the joint, or one of each joint, into `directory`; returns their names.
 
     origin: sha256 and date of `extended`. Raises ConfigError.
     """
-    names = extended_files(joints, findings)
-    for name, number in names.items():
+    names = {n: f"extended.joint{n}.yaml" if len(joints) > 1 else EXTENDED for n in sorted(joints)}
+    for number, name in names.items():
         joint = extended(joints[number], number, findings, **origin)
         write_joint(directory / name, joint, extended_title(number, findings))
-    return list(names)
+    return list(names.values())
 
 
 def _record(cause: Cause) -> dict[str, Any]:

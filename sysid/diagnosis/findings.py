@@ -152,11 +152,6 @@ class Cause:
         fitted = [name for name, value in self.parameters.items() if value.fitted]
         return next(iter([*fitted, *self.parameters]), "")
 
-    @property
-    def evidence(self) -> dict[str, float | None]:
-        """As findings.json has it; the gain of a single entry on held-out runs is promised and not measured."""
-        return {"delta_bic": self.delta_evidence, "held_out_gain": None}
-
 
 class Present(NamedTuple):
     """An effect that is present, with all its parameters by name."""
@@ -190,11 +185,6 @@ class CandidateEvidence:
     delta_bic: float
     minimum: Mapping[str, Value]  # minimum detectable size of its leading parameter(s); value inf: invisible
     reason: str  # "in the set, certain", "no evidence beyond the set", "needs a temperature", ...
-
-    @property
-    def evidence(self) -> dict[str, float | None]:
-        """As findings.json has it, see `Cause.evidence`."""
-        return {"delta_bic": self.delta_bic, "held_out_gain": None}
 
     @property
     def sizes(self) -> dict[str, dict[str, Any]]:
@@ -396,19 +386,6 @@ class Findings:
         return counted(count, "run") if used == count else f"{used} of {counted(count, 'run')}"
 
 
-_KEYS: Final[Mapping[type, str]] = {
-    Gap: "joint rmse_nm noise_floor_nm localisation balance floor_from",
-    Cause: "name joint class=names parameters grade matters rivals given doubts evidence rms_nm balance explained_share",
-    CandidateEvidence: "name joint evidence shared=null minimum=sizes minimum_rms_nm=null reason",
-    Gain: "rmse_before_nm rmse_after_nm split ci95 joint balance plain_nm=null free_run_before_rad_s=null "
-    "free_run_after_rad_s=null free_run_position_before_rad=null free_run_position_after_rad=null runs",
-    OutlierRun: "run what channel joint value usual unit or=others text",
-}
-"""Keys in findings.json of the classes whose keys are not their fields, in order. "key=attribute": where both differ;
-"key=null": promised and never measured.
-"""
-
-
 def to_mapping(
     findings: Findings, *, sha256: Mapping[str, str] | None = None, files: Sequence[str] = ()
 ) -> dict[str, Any]:
@@ -432,7 +409,7 @@ def to_mapping(
         "unexplained": findings.unexplained,
         "next_experiment": experiment,
         "reasons": findings.reasons,
-        "outlier_runs": findings.outlier_runs,
+        "outlier_runs": [{**vars(each), "text": each.text} for each in findings.outlier_runs],
         "too_small": [_cause(each, findings.joint_files) for each in findings.too_small],
         "cannot_be_told": findings.cannot_be_told,
         "joints": findings.joints,
@@ -441,7 +418,7 @@ def to_mapping(
             for name in findings.runs
         ],
         "gaps": findings.gaps,
-        "candidates": findings.candidates,
+        "candidates": [{**vars(each), "minimum": each.sizes} for each in findings.candidates],
         "channel_notes": findings.channel_notes,
         "relevance": findings.relevance,
         "priors": priors(findings.trust),
@@ -452,32 +429,27 @@ def to_mapping(
 
 
 def _cause(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:
-    """Return a cause as findings.json has it: beside each value that of the joint file, if there is one, and the change."""
+    """Return a cause with its class, and beside each value that of the joint file, if there is one, and the change."""
     known = file_values(cause.name, cause.joint, joints)
-    values = {name: keyed(value) for name, value in cause.parameters.items()}
-    for name in values.keys() & known.keys():
-        change = known[name].change(cause.parameters[name].value)
-        values[name] |= {"file_value": known[name].value, "change": change}
-    return keyed(cause) | {"parameters": values}
-
-
-def keyed(value: Any) -> dict[str, Any]:
-    """Return what findings.json has of a value of one of the classes above, by key: its fields, if `_KEYS` has no others."""
-    found = {}
-    for entry in _KEYS.get(type(value), " ".join(type(value).__annotations__)).split():
-        key, _, attribute = entry.partition("=")
-        found[key] = None if attribute == "null" else getattr(value, attribute or key)
-    return found
+    values: dict[str, Any] = {}
+    for name, value in cause.parameters.items():
+        change = known[name].change(value.value) if name in known else None
+        of_file = {"file_value": known[name].value, "change": change} if name in known else {}
+        values[name] = {"value": value.value, "ci95": value.ci95, "unit": value.unit} | of_file
+    more = {"class": cause.names, "parameters": values, "evidence": {"delta_bic": cause.delta_evidence}}
+    return {key: value for key, value in vars(cause).items() if key != "delta_evidence"} | more
 
 
 def plain(value: Any) -> Any:
-    """Return the same value with what JSON knows: frozen values by key, numpy's numbers and arrays plain, NaN and infinity
+    """Return the same value with what JSON knows: frozen values by field, numpy's numbers and arrays plain, NaN and infinity
     None. Raises TypeError for anything else.
     """
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
-    elif is_dataclass(value) or hasattr(value, "_asdict"):
-        value = keyed(value)
+    elif is_dataclass(value):
+        value = vars(value)
+    elif hasattr(value, "_asdict"):
+        value = value._asdict()
     if value is None or isinstance(value, str | bool | int):
         return value
     if isinstance(value, float):

@@ -52,8 +52,6 @@ _BY_HAND: Final = {
 """Two effects -> what separates them besides a motion."""
 PLAN_FILE: Final = "next_experiment.plan.yaml"
 MOTION_FILE: Final = "next_experiment.motion.csv"
-CONFIG: Final = "CONFIG"
-"""Stands in a command for a configuration of jtqd that is not known."""
 _RANGE: Final = ("travel_rad", "velocity_rad_s", "acceleration_rad_s2")
 """Limits that the motion of a joint without runs needs."""
 _INSIDE: Final = 0.05
@@ -119,11 +117,6 @@ def next_experiment(
         f"{plan.limits.current_a:g} A."
     )
     return {"why": " ".join(parts), "plan": plan.to_mapping()}
-
-
-def campaign_command(plan: str = PLAN_FILE, bus: str = "can0", config: str = CONFIG) -> str:
-    """Return the command that runs a plan; config: of the bench, "" for the one that ships."""
-    return f"jtq campaign {plan} --bus {bus}{f' --config {config}' if config else ''} --out RUNS"
 
 
 def each_joint(experiments: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:

@@ -172,23 +172,20 @@ def headline(findings: Findings) -> tuple[str, ...]:
         where = _joined(", ", rest, _remaining_places(findings, 1)) if rest else ""
         return (f"{_joined(': ', 'No entry explains the gap', where)}.",)
     second = _joined(", but ", _gain(findings), f"{rest} remain unexplained" if rest else "")
-    found = _headline_causes(causes, findings.joint_files)
+    found = _headline_cause(causes[0], findings.joint_files)
     return (found, f"{_capital(second)}.") if second else (found,)
 
 
-def _headline_causes(causes: Sequence[Cause], files: Mapping[int, Joint]) -> str:
-    first, share, size = causes[0], _percent(causes[0].explained_share), _size(causes[0], files)
-    names = listed([_of(first), *(_rival(name, first.joint) for name in first.rivals[:2])], "or")
-    text = f"{_capital(names)} explains {f'{share} of ' if share else ''}the gap"
-    if first.grade != ONE_OF:
-        text = f"{_joined(': ', text, size)} ({first.grade})"
-    elif size:
-        text += f" ({size} if it is {effect_title(first.name)})"
-    if len(causes) > 1:
-        more = len(causes) - 2
-        text += f"; {_joined(' ', _of(causes[1]), _percent(causes[1].explained_share))} ({_grade(causes[1])})"
-        text += f" and {counted(more, 'smaller entry', 'smaller entries')}" if more else ""
-    return f"{text}."
+def _headline_cause(cause: Cause, files: Mapping[int, Joint]) -> str:
+    """Return the largest entry, its share and size; of several alike that these runs do not distinguish, all of them."""
+    names = listed([_of(cause), *(_rival(name, cause.joint) for name in cause.rivals[:2])], "or")
+    text = _joined(
+        " of ", f"{_capital(names)} explains {_percent(cause.explained_share)}".rstrip(), "the gap"
+    )
+    size = _size(cause, files)
+    if cause.grade != ONE_OF:
+        return f"{_joined(': ', text, size)} ({cause.grade})."
+    return f"{text} ({size} if it is {effect_title(cause.name)})." if size else f"{text}."
 
 
 def _gain(findings: Findings) -> str:
@@ -253,32 +250,34 @@ def _rival(name: str, joint: JointName) -> str:
 
 def _grades(causes: Sequence[Cause], findings: Findings) -> str:
     """Return what the grades in the table mean, and the priors that a certain entry rests on."""
-    grades = {c.grade for c in causes}
+    sure = [c for c in causes if c.grade == CERTAIN]
+    doubtful = next((c for c in causes if c.grade == EFFECTIVE), None)
     texts = []
-    if CERTAIN in grades:
-        sure = [c for c in causes if c.grade == CERTAIN]
-        absent = {c.name for c in findings.candidates if math.isnan(c.delta_bic)}  # of a sensor that is none
-        names = dict.fromkeys([*(c.name for c in sure), *(name for c in sure for name in _scales_alike(c))])
-        rows = {row.name: row for row in priors(findings.trust) if row.name not in absent}
-        sizes: dict[str, list[str]] = {}
-        for row in (rows[name] for name in names if name in rows):
-            size = f"{row.size}{' (as set)' if row.set_by_user else ''}"
-            sizes.setdefault(size, []).append(effect_title(row.name))
-        given = ", ".join(f"{listed(of)} ± {size}" for size, of in sizes.items())
+    if sure:
+        given = _priors_behind(sure, findings)
         texts.append(f"certain: given {given}" if given else "certain: no other set is nearly as good")
-    if ONE_OF in grades:
+    if any(c.grade == ONE_OF for c in causes):
         texts.append("one of: these runs do not distinguish them")
-    if EFFECTIVE in grades:
-        first = next(c for c in causes if c.grade == EFFECTIVE)
-        why = f" ({effect_title(first.name)}: {first.doubts[0]})" if first.doubts else ""
+    if doubtful is not None:
+        why = f" ({effect_title(doubtful.name)}: {doubtful.doubts[0]})" if doubtful.doubts else ""
         texts.append(f"effective: predicts, but what it stands for is not settled{why}")
     return f"{'; '.join(texts)}." if texts else ""
 
 
-def _scales_alike(cause: Cause) -> list[str]:
-    """Return the other effects that scale the balance of a cause which scales it: priors decide between them."""
-    scaling = [e.name for e in EFFECTS.values() if e.scales_all or e.scales_balance == cause.balance]
-    return [name for name in scaling if name != cause.name] if cause.name in scaling else []
+def _priors_behind(causes: Sequence[Cause], findings: Findings) -> str:
+    """Return the priors of these entries, and of all effects that would scale the same balance, by their sizes."""
+    names = [c.name for c in causes]
+    for c in causes:
+        scaling = [e.name for e in EFFECTS.values() if e.scales_all or e.scales_balance == c.balance]
+        names += scaling if c.name in scaling else []
+    absent = {c.name for c in findings.candidates if math.isnan(c.delta_bic)}  # of a sensor that is none
+    rows = {row.name: row for row in priors(findings.trust) if row.name not in absent}
+    sizes: dict[str, list[str]] = {}
+    for row in (rows[name] for name in dict.fromkeys(names) if name in rows):
+        sizes.setdefault(f"{row.size}{' (as set)' if row.set_by_user else ''}", []).append(
+            effect_title(row.name)
+        )
+    return ", ".join(f"{listed(of)} ± {size}" for size, of in sizes.items())
 
 
 def _next(why: str) -> str:
@@ -454,19 +453,15 @@ class Picture(NamedTuple):
 def worst_trace(findings: Findings) -> tuple[Trace, bool] | None:
     """Return the trace to draw, and whether its run was held out; None without traces.
 
-    It is of the balance that the gain is of (without one, of the largest entry, else of the largest gap), and of the run on
-    which the extended model errs most there; where no run was held out, the joint file.
+    It is of the balance that the gain is of (without one, of the largest gap), and of the run on which the extended model
+    errs most there; where no run was held out, the joint file.
     """
-    gain, traces = findings.gain, findings.traces
-    first = (*([gain] if gain else ()), *findings.causes[:1], *findings.gaps, *traces)
-    channels = [(x.joint, x.balance) for x in first]
-    groups = [[t for t in traces if (t.joint, t.balance) == channel] for channel in channels]
-    k = next((k for k, group in enumerate(groups) if group), None)
-    if k is None:
-        return None
-    errors = {each.run: each.rmse_after_nm for each in gain.runs} if gain and k == 0 else {}
-    worst = max(groups[k], key=lambda t: (errors.get(t.run, 0.0), np.nansum(t.before_nm**2)))
-    return worst, worst.run in errors
+    gain = findings.gain
+    of = [gain] if gain else findings.gaps[:1]
+    shown = [t for t in findings.traces if (t.joint, t.balance) in [(x.joint, x.balance) for x in of]]
+    errors = {each.run: each.rmse_after_nm for each in gain.runs} if gain else {}
+    worst = max(shown, key=lambda t: (errors.get(t.run, 0.0), float(np.nansum(t.before_nm**2))), default=None)
+    return None if worst is None else (worst, worst.run in errors)
 
 
 def picture(findings: Findings) -> Picture | None:
