@@ -20,10 +20,10 @@ from jtqd.estimator.observer cimport (
     observe_fused, restart_guard
 )
 from jtqd.estimator.fusion cimport (
-    Checkpoint, Fused, Learned, Rest, TURN_WAVES, at_rest, degrades, disagreement, drop_block, early_factor, fading,
+    Checkpoint, Fused, Learned, Rest, TURN_WAVES, apart_nm2, at_rest, degrades, drop_block, early_factor, fading,
     fill_agreement, fill_fusion, fill_offsets, fill_proof, fuse_paths, gather, implausible, keep_offsets, known_nm2,
     local_stiffness, mismatch_variance, offsets_of, pause_turn, possible_error, prove, report_offsets, restart_agreement,
-    restart_offsets, restart_proof, restart_turn, reweigh, turn_differs, unproven_nm2, update_difference, update_turn
+    restart_offsets, restart_proof, restart_turn, reweigh, turn_differs, unlearned_nm2, unproven_nm2, update_difference, update_turn
 )
 from jtqd.estimator.native_network cimport (
     PATH_INPUTS, Perceptron, evaluate, fill_fused_trust, fill_path, fill_trust, follow_path, fused_trust, path_trust,
@@ -553,17 +553,16 @@ cdef class FusedEstimator(Estimator):
             degraded = True
         out.sigma_nm = scale * (best.sigma * early)
         # an uncorrected offset counts once: as mismatch, where the file has section agreement
-        wider = disagreement(&best, 0.0 if law.agreement.used else s.offsets.uncorrected_nm)
+        wider = apart_nm2(&best, 0.0 if law.agreement.used else s.offsets.uncorrected_nm)
         if wider > 0.0:
-            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + wider * wider)
+            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + wider)
         if law.agreement.used:
             mismatch = mismatch_variance(&s.agreement, best.alpha, seen.torsion_nm)
             if degrades(
                 &law.agreement, &s.agreement, &s.offsets, mismatch, out.sigma_nm, best.alpha, seen.torsion_nm
             ):
                 s.degraded_s, degraded = LOWERED_S, True
-            # an offset estimated while the paths disagree is as uncertain as they are
-            mismatch += best.alpha * best.alpha * fmin(known, s.agreement.mismatch)
+            mismatch += unlearned_nm2(&s.agreement, best.alpha, known)
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + mismatch)
         if s.inputs.doubt > DOUBTFUL * law.inputs.tolerance:
             s.degraded_s, degraded = LOWERED_S, True
@@ -572,7 +571,7 @@ cdef class FusedEstimator(Estimator):
         elif standing and alone and law.network.used:
             out.sigma_nm = hypot(law.rest, 2.0 * (1.0 - trusted) * law.outside)
         elif standing:
-            out.sigma_nm = self.half_interval(seen, &physics, loss.half, wider * wider + mismatch, out.sigma_nm)
+            out.sigma_nm = self.half_interval(seen, &physics, loss.half, wider + mismatch, out.sigma_nm)
         if law.tracked and out.status != STANDSTILL:  # measured in motion; of the torsion, by its share
             out.sigma_nm = sqrt(
                 out.sigma_nm * out.sigma_nm

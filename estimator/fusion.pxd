@@ -27,7 +27,7 @@ cdef Rest at_rest(
     const FusionLaw *law, double alpha, double raw, double half, double v, double torsion, double open_nm
 ) noexcept nogil
 
-cdef double disagreement(const Fused *fused, double uncorrected_nm) noexcept nogil
+cdef double apart_nm2(const Fused *fused, double uncorrected_nm) noexcept nogil
 
 cdef struct ProofLaw:
     double most, tolerance, stiffness, day  # day: square of the usual correction [Nm^2]
@@ -166,6 +166,7 @@ cdef void update_turn(
 ) noexcept nogil
 cdef bint turn_differs(const AgreementLaw *law, const AgreementState *s) noexcept nogil
 cdef double mismatch_variance(const AgreementState *s, double alpha, double torsion) noexcept nogil
+cdef double unlearned_nm2(const AgreementState *s, double alpha, double known) noexcept nogil
 cdef bint degrades(
     const AgreementLaw *law,
     const AgreementState *s,

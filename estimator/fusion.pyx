@@ -210,17 +210,14 @@ cdef double reach(const Fused *fused, double sigmas) noexcept nogil:
     return fused.half + sigmas * sqrt(fmax(fused.variance - fused.half * fused.half, 0.0))
 
 
-cdef double disagreement(const Fused *fused, double uncorrected_nm) noexcept nogil:
-    """Return what a disagreement of the paths adds to sigma [Nm]; uncorrected_nm: known offset that is not corrected yet.
+cdef double apart_nm2(const Fused *fused, double uncorrected_nm) noexcept nogil:
+    """Return what a disagreement of the paths adds to sigma^2 [Nm^2]; uncorrected_nm: known offset that is not corrected yet.
 
     The offset is an error of a known size, not of a known variance: the 90 % interval, not sigma, is to hold it.
     """
-    cdef double more = fabs(fused.difference) - reach(fused, DISAGREE)
+    cdef double more = fmax(fabs(fused.difference) - reach(fused, DISAGREE), 0.0) * fmax(fused.alpha, 1.0 - fused.alpha)
     cdef double offset = INTERVAL * fused.alpha * uncorrected_nm
-    if more > 0.0:
-        more *= fmax(fused.alpha, 1.0 - fused.alpha)
-        return sqrt(more * more + offset * offset)
-    return offset
+    return more * more + offset * offset
 
 
 cdef double possible_error(const Fused *fused) noexcept nogil:
@@ -861,6 +858,11 @@ cdef double mismatch_variance(const AgreementState *s, double alpha, double tors
     return _by_share(alpha, s.mismatch, s.gain_mismatch, torsion)
 
 
+cdef double unlearned_nm2(const AgreementState *s, double alpha, double known) noexcept nogil:
+    """Return the addition to sigma^2 [Nm^2] by an offset that was learned, `known` [Nm^2], while the paths disagree."""
+    return alpha * alpha * fmin(known, s.mismatch)
+
+
 cdef bint degrades(
     const AgreementLaw *law,
     const AgreementState *s,
@@ -915,35 +917,48 @@ def levels(fused, double rated_nm, dt_s, difference_nm, direction, velocity_rad_
 
 
 def track_run(
-    fused, rated_nm, dt_s, difference_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope, stiffness, bint tracked=True
+    fused, rated_nm, dt_s, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm, difference_nm, direction, slope, stiffness,
+    bint tracked=True
 ):
-    """Return (torsion, current, known, mismatch, gain, early) of a run from its start, as the estimator has them at each sample.
+    """Return (alpha, torsion, current, spread, more, known) of a run from its start, as the estimator has them at each sample.
 
-    torsion, current: corrections of both paths [Nm]; known: reduction of s_t^2 [Nm^2]; mismatch [Nm^2] and gain mismatch, see
-    `mismatch_variance`; early: factor on the spread, 1 without spread over the days. Arrays [n] of samples in motion:
-    difference_nm: torsion less current path; variance_nm2: of that; slope: dL/draw of the loss; stiffness: d tau_t/d d of the
-    spring [Nm/rad]. tracked: offsets are corrected.
+    alpha: share of the torsion; torsion, current: corrections of both paths [Nm]; spread: standard deviation of the value [Nm],
+    scale 1, with `early`; more: what widens it [Nm^2]; known: reduction of s_t^2 [Nm^2]. Arrays [n] of samples in motion, `fused`
+    with a torsion. difference_nm: torsion less current path; slope: dL/draw of the loss; stiffness: d tau_t/d d of the spring
+    [Nm/rad]. tracked: offsets are corrected.
     """
-    columns = (dt_s, difference_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope, stiffness)
+    columns = (
+        dt_s, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm, difference_nm, direction, slope, stiffness
+    )
     cdef const double[:, ::1] x = np.ascontiguousarray(np.column_stack(columns), np.float64)
     out = np.zeros((6, x.shape[0]))
     cdef double[:, ::1] to = out
+    cdef FusionLaw paths
     cdef OffsetLaw law
     cdef OffsetState s
     cdef AgreementLaw levels_law
     cdef AgreementState agreement
-    cdef double link, current
+    cdef Fused physics
+    cdef double raw, torsion, difference, known
     cdef Py_ssize_t k
+    fill_fusion(&paths, fused.sigma, True)
+    paths.reference = 0.0
     # the current offset counts as a torque: its part of the difference does not depend on the torque per ampere
     fill_offsets(&law, 1.0, rated_nm, fused, tracked, True)
     fill_agreement(&levels_law, fused.agreement, rated_nm)
     restart_offsets(&law, &s)
     restart_agreement(&agreement)
     for k in range(x.shape[0]):
-        link, current = x[k, 7] * s.link_rad, -(1.0 - x[k, 6]) * s.current_a
-        to[0, k], to[1, k], to[2, k] = link, current, known_nm2(&law, &s)
-        to[3, k], to[4, k] = agreement.mismatch, agreement.gain_mismatch
-        to[5, k] = early_factor(&law, to[2, k])
-        if gather(&s, x[k, 0], x[k, 1] + link - current, x[k, 2], x[k, 3], x[k, 4] + link, x[k, 5] - law.spread_nm):
-            update_difference(&law, &s, &levels_law, &agreement, x[k, 7], x[k, 6])
+        to[1, k], to[2, k] = x[k, 9] * s.link_rad, -(1.0 - x[k, 8]) * s.current_a
+        raw, torsion, difference = x[k, 1] - s.current_a, x[k, 4] + to[1, k], x[k, 6] + to[1, k] - to[2, k]
+        physics = fuse_paths(&paths, raw, raw - torsion + difference, x[k, 2], x[k, 3], torsion, x[k, 5])
+        if gather(&s, x[k, 0], difference, x[k, 7], x[k, 3], torsion, physics.variance - law.spread_nm):
+            update_difference(&law, &s, &levels_law, &agreement, x[k, 9], x[k, 8])
+        known = known_nm2(&law, &s)
+        if law.spread > 0.0:
+            reweigh(&physics, known)
+        to[0, k], to[3, k], to[5, k] = physics.alpha, physics.sigma * early_factor(&law, known), known
+        to[4, k] = apart_nm2(&physics, 0.0 if levels_law.used else s.uncorrected_nm)
+        if levels_law.used:
+            to[4, k] += mismatch_variance(&agreement, physics.alpha, torsion) + unlearned_nm2(&agreement, physics.alpha, known)
     return tuple(out)

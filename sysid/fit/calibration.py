@@ -65,9 +65,9 @@ Held-out residuals: the error of current path and torsion path on a run that the
     error = e_c + alpha (e_t - e_c)                          with the delay of the motor path
     spread = early sqrt(s_c^2 s_t^2/(s_c^2 + s_t^2))         early: the day's offset is not yet known
     error, no delay = e_tracked + (1 - alpha) (e_c - e_t')   e_t': of the tracked torsion through the motor path's filter
-    more^2 = (disagreement beyond DISAGREE_SIGMAS)^2 + doubt^2
+    more^2 = what widens sigma in the estimator beside that
 
-With `track_zeros` the corrections of both paths are in all of them. early, disagreement, doubt: fusion.pyx.
+With `track_zeros` the corrections of both paths are in all of them. early, more: `track_run` of fusion.pyx.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray
 from jtqd.estimator.estimator import SLOPE_NM, quadrants
-from jtqd.estimator.fusion import DISAGREE_SIGMAS, GAUSS, Fusion, faded, track_run
+from jtqd.estimator.fusion import GAUSS, Fusion, faded, track_run
 from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Standstill, Torsion, Tracking
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
@@ -220,38 +220,32 @@ def fused_errors(
 ) -> FusedErrors:
     """Return the errors that the estimator makes in a run with this section.
 
-    rated_nm None, or a joint without torsion: nothing is learned in the run, neither offsets nor doubt.
+    rated_nm None, or a joint without torsion: nothing is learned in the run, and nothing widens the spread.
     """
-    fusion = Fusion(replace(fused.sigma, reference_nm=0.0), fused.torsion is not None)
-    paths = fusion.fuse(*run.fusion_inputs)
-    torsion, current, known, doubt, gain = np.zeros((5, len(run.raw_nm)))
-    early = np.ones(len(run.raw_nm))
-    if rated_nm is not None and fused.torsion is not None and len(run.dt_s):
-        torsion, current, known, doubt, gain, early = track_run(
+    torsion, current, more, known = np.zeros((4, len(run.raw_nm)))
+    if rated_nm is None or fused.torsion is None or not len(run.dt_s):
+        fusion = Fusion(replace(fused.sigma, reference_nm=0.0), fused.torsion is not None)
+        alpha, _, spread, _ = fusion.fuse(*run.fusion_inputs)
+    else:
+        alpha, torsion, current, spread, more, known = track_run(
             fused,
             rated_nm,
-            *run.difference,
-            paths.variance_nm2,
+            run.dt_s,
+            *run.fusion_inputs,
+            run.apart_nm,
+            run.direction,
             run.slope,
             run.stiffness_nm_per_rad,
             track_zeros,
         )
-    if known.any():
-        paths = fusion.fuse(*run.fusion_inputs, known_nm2=known)
-    alpha, _, spread, variance = paths
     e_c, e_t = run.current_error_nm + current, run.torsion_error_nm + torsion
-    share = np.maximum(alpha, 1.0 - alpha)
-    more = (doubt + (gain * (run.torsion_nm + torsion)) ** 2) * share**2 + alpha**2 * np.minimum(known, doubt)
-    if fused.torsion is not None:
-        near = run.half_nm + DISAGREE_SIGMAS * np.sqrt(np.maximum(variance - run.half_nm**2, 0.0))
-        more += (share * np.maximum(np.abs(e_t - e_c) - near, 0.0)) ** 2
     undelayed = NONE
     if len(run.tracked_nm):
         undelayed = run.tracked_nm + torsion + (1.0 - alpha) * (e_c - run.delayed_nm - torsion)
     return FusedErrors(
         e_c + alpha * (e_t - e_c),
         undelayed,
-        spread * early,
+        spread,
         more,
         run.velocity_rad_s,
         quadrants(run.raw_nm, run.velocity_rad_s),

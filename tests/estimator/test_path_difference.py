@@ -234,7 +234,8 @@ def test_fits_see_what_the_loop_does() -> None:
     parts = (raw, faded(half, half_dt, np.ones(len(raw), bool)), v, torsion, open_nm)
     fusion = Fusion(both.fused.sigma, True)
     signals = (half_dt, torsion - (raw - loss), s, v, torsion, fusion.fuse(*parts).variance_nm2, slope)
-    taken, _, known, *_ = track_run(both.fused, both.rated_torque_nm, *signals, np.full(len(raw), K))
+    whole = (half_dt, *parts, signals[1], s, slope, np.full(len(raw), K))
+    _, taken, *_, known = track_run(both.fused, both.rated_torque_nm, *whole)
     slow, fast, gain, left, _ = (each[-1] for each in levels(both.fused, both.rated_torque_nm, *signals))
 
     plain, zeros = tracked(columns, LEARNING)
@@ -253,23 +254,19 @@ def test_fits_see_what_the_loop_does() -> None:
     assert alpha**2 * known[-1] > 0.06 * more
 
 
+def run_of(v: FloatArray, difference_nm: FloatArray, torsion_nm: FloatArray) -> tuple[FloatArray, ...]:
+    """What `track_run` takes of a run at 1 kHz whose friction is one-sided and whose loss does not depend on the load."""
+    none = np.zeros(len(v))
+    raw = torsion_nm - difference_nm
+    return 1e-3 + none, raw, none, v, torsion_nm, none, difference_nm, np.sign(v), none, K + none
+
+
 def test_what_is_not_yet_taken_off_is_not_known() -> None:
     n = 4000
     v = 1.2 * np.sin(2.5e-3 * np.arange(n) + 0.4)
     one, zero_nm = np.ones(n), 12.0
     assert LEARNING.fused is not None
-    taken, _, known, *_ = track_run(
-        LEARNING.fused,
-        40.0,
-        1e-3 * one,
-        -zero_nm * one,
-        np.sign(v),
-        v,
-        5.0 * np.sin(v),
-        0.3 * one,
-        0.0 * one,
-        K * one,
-    )
+    _, taken, *_, known = track_run(LEARNING.fused, 40.0, *run_of(v, -zero_nm * one, 5.0 * np.sin(v)))
     late = zero_nm - taken
     assert taken[-1] == pytest.approx(zero_nm, rel=0.01)
     assert known[late > DAYS.spread_nm].max() < 1e-3
@@ -314,12 +311,16 @@ def test_without_the_key_nothing_is_wider() -> None:
     assert old.fused.zeros.early == 1.0
     columns, _ = driven(4.0, link_zero_rad=2e-5)
     dt, _, motor, *_ = columns
-    on = np.full(len(dt), K)
-    v = np.gradient(motor / 100.0, 1e-3)
-    *_, early = track_run(
-        old.fused, 40.0, dt, 0.1 * on / K, np.sign(v), v, 5.0 * on / K, 0.3 * on / K, 0.0 * on, on
+    v, one = np.gradient(motor / 100.0, 1e-3), np.ones(len(dt))
+    run = run_of(v, 0.1 * one, 5.0 * one)
+    spread, wider = (
+        track_run(replace(old.fused, zeros=replace(old.fused.zeros, early=early)), 40.0, *run)[3]
+        for early in (old.fused.zeros.early, 1.5)
     )
-    assert np.array_equal(early, np.ones(len(dt)))
+    paths = Fusion(replace(old.fused.sigma, reference_nm=0.0), True)
+    *_, known = track_run(old.fused, 40.0, *run)
+    assert spread == pytest.approx(paths.fuse(*run[1:6], known_nm2=known).sigma_nm, rel=1e-3)
+    assert wider == pytest.approx(spread * (1.5 - 0.5 * known / old.fused.zeros.spread_nm**2), rel=1e-12)
 
 
 # ---- agreement
@@ -478,16 +479,19 @@ def test_of_a_gain_only_what_is_beyond_its_own_standard_deviations_is_doubt() ->
     fused = USUAL.fused
     assert fused is not None
     n = 6000
-    v, one = 1.2 * np.sin(2.5e-3 * np.arange(n) + 0.4), np.ones(n)
+    v = 1.2 * np.sin(2.5e-3 * np.arange(n) + 0.4)
     torque = 20.0 * np.sign(v)
-    signals = (1e-3 * one, 0.05 * torque, np.sign(v), v, torque, 0.3 * one, 0.0 * one)
+    run = run_of(v, 0.05 * torque, torque)
+    variance = Fusion(fused.sigma, True).fuse(*run[1:6]).variance_nm2
+    signals = (run[0], run[6], run[7], v, torque, variance, run[8])
     loud = replace(AGREEMENT, slow_nm=20.0, fast_nm=20.0, gain=0.002, zero_nm=20.0)
     found = []
     for sigmas in (0.0, 0.5, 1.0, 10.0):
         of_file = replace(fused, agreement=replace(loud, gain_sigmas=sigmas))
-        *_, doubt, _ = track_run(of_file, USUAL.rated_torque_nm, *signals, K * one, False)
+        alpha, *_, more, _ = track_run(of_file, USUAL.rated_torque_nm, *run, False)
         gain = levels(of_file, USUAL.rated_torque_nm, *signals)[2][-1]
-        assert doubt[-1] == pytest.approx(loud.gain_factor * max(gain - 0.002, 0.0), rel=1e-9)
+        doubt = loud.gain_factor * max(gain - 0.002, 0.0) * max(alpha[-1], 1.0 - alpha[-1]) * torque[-1]
+        assert more[-1] == pytest.approx(doubt**2, rel=1e-6)
         found.append(gain)
     assert found[0] > 0.02
     assert found[0] - found[1] == pytest.approx(found[1] - found[2], rel=1e-9)
@@ -500,19 +504,20 @@ def test_a_zero_that_is_not_taken_off_counts_by_its_factor() -> None:
     assert fused is not None
     n = 4000
     v, one = 1.2 * np.sin(2.5e-3 * np.arange(n) + 0.4), np.ones(n)
-    signals = (1e-3 * one, -2.0 * one, np.sign(v), v, 5.0 * np.sin(v), 0.3 * one, 0.0 * one, K * one)
+    run = run_of(v, -2.0 * one, 5.0 * np.sin(v))
     loud = replace(AGREEMENT, slow_nm=20.0, fast_nm=20.0, gain=1.0)
     doubts = [
         track_run(
             replace(fused, agreement=replace(loud, zero_factor=factor)),
             USUAL.rated_torque_nm,
-            *signals,
+            *run,
             False,
-        )[3]
-        for factor in (1.0, 1.5)
+        )[4]
+        for factor in (1.0, 1.5, 2.0)
     ]
-    assert doubts[0].max() > 1.0
-    np.testing.assert_allclose(doubts[1], 2.25 * doubts[0], rtol=1e-12)
+    wider, widest = doubts[1] - doubts[0], doubts[2] - doubts[0]  # without what the views differ by
+    assert wider.max() > 1.0
+    np.testing.assert_allclose(1.25 * widest, 3.0 * wider, rtol=1e-12, atol=1e-12)
 
 
 # ---- waves over the motor's turn
