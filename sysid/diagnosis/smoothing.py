@@ -74,6 +74,8 @@ _DIGITS: Final = 9
 """Significant digits from which a decimal is as good as none."""
 _ON_GRID: Final = 0.95
 """Part of the small distances between values that are whole multiples of the least, on a grid."""
+_COARSE: Final = 0.25
+"""Part of a grid's step to which a distance must be known, to show it."""
 _SEGMENT: Final = 64
 """Samples of a spectrum."""
 _SLOW: Final = 0.125
@@ -105,11 +107,9 @@ def steps_of(x: FloatArray) -> FloatArray:
         if len(values) <= 8:  # at rest or commanded: they show no step
             continue
         largest = max(float(np.max(np.abs(values))), 1e-12)
-        out[there] = max(
-            _decimal(values, largest),
-            _single(values),
-            _counts(values, largest, again=len(values) < 0.8 * there.sum()),
-        )
+        printed = max(_decimal(values, largest), _single(values))
+        counts = _counts(values, largest, printed, again=len(values) < 0.8 * there.sum())
+        out[there] = max(printed, counts)
     decade = _decades(np.abs(x))
     for e in np.unique(decade):  # few beyond a power of ten have ten times the step
         there = decade == e
@@ -202,19 +202,20 @@ def _single(values: FloatArray) -> float:
     return float(np.spacing(np.max(np.abs(short)))) if np.array_equal(short, values) else 0.0
 
 
-def _counts(values: FloatArray, largest: float, *, again: bool) -> float:
+def _counts(values: FloatArray, largest: float, printed: float, *, again: bool) -> float:
     """Return the step of values on a grid, 0 where they are on none or too far apart to show it; again: values came more
-    than once. Of a steady motion all distances are alike, too.
+    than once. Of a steady motion all distances are alike, too. A distance is known to the step that is printed.
     """
     apart = np.diff(values)
     apart = apart[apart > _SAME * largest]
     if len(apart) < 8:
         return 0.0
-    step = float(apart.min())
+    step = float(apart[apart < 1.5 * apart.min()].mean())
     near = apart[apart < 20.0 * step] / step
-    on = np.abs(near - np.round(near)) < 0.02
+    off = 0.02 + printed / step
+    on = np.abs(near - np.round(near)) < off
     grid = len(near) >= 8 and float(on.mean()) >= _ON_GRID and (again or len(np.unique(np.round(near))) > 2)
-    return step if grid else 0.0
+    return step if grid and off < _COARSE else 0.0
 
 
 def acceleration_noise(

@@ -74,6 +74,17 @@ def test_a_few_values_that_come_again_show_no_steps() -> None:
     assert steps_of(x)[-1] == pytest.approx(1e-4)
 
 
+def test_counts_that_are_printed_with_few_digits_are_a_grid() -> None:
+    """14 bits, seven digits: the last is a thirtieth of a count, and no two distances are printed alike."""
+    count = 2.0 * math.pi / 2**14
+    x = 50.0 + 40.0 * np.sin(ramp(60.0))
+    x = digits(np.round(x / count) * count, 7)
+    assert steps_of(x)[x > 10.0] == pytest.approx(count, rel=2e-3)
+    assert noise_of(x)[x > 10.0] == pytest.approx(count / math.sqrt(12.0), rel=0.02)
+    coarse = digits(x, 5)
+    assert steps_of(coarse)[coarse > 10.0] == pytest.approx(1e-3), "a grid finer than what is printed is none"
+
+
 def test_a_steady_motion_is_no_grid() -> None:
     rng = np.random.default_rng(0)
     x = 1000.0 + 0.1 * np.arange(400) + 1e-4 * rng.normal(size=400)
