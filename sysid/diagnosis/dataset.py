@@ -368,10 +368,8 @@ def build_dataset(
     every = [s for run in signals for s in run]
     step = bin_samples(every) * max(s.step_s for s in every)
     candidates = _whole_orders(signals, library_candidates(signals, joints, scope), scope)
-    groups = families(signals, unknown_lines(signals, candidates, step))
     no_torque = bool(scope.known_references & set(joints))
-    if no_torque:  # a known load has no zero that differs from run to run
-        groups = [group for group in groups if group.name != "zero"]
+    groups = families(signals, unknown_lines(signals, candidates, step), computed=no_torque)
     runs = binned_runs(signals, step, candidates, groups)
     found = recordings(signals), readings(signals)
     return Dataset(signals, runs, candidates, step, groups, *found, no_torque=no_torque)

@@ -27,7 +27,8 @@ from jtqd.estimator.effects.effect import (
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
-from jtqd.sysid.diagnosis.signals import SLOWEST_RAD_S, Channel, JointSignals, Line
+from jtqd.sysid.diagnosis.signals import COMPUTED_HZ, SLOWEST_RAD_S, Channel, JointSignals, Line
+from jtqd.sysid.diagnosis.smoothing import second_difference
 from jtqd.sysid.diagnosis.smoothing import second_difference
 
 BIN_S: Final = 0.005
@@ -260,6 +261,10 @@ _AXES: Final = {
 """Operating conditions, and what they are in the state."""
 _ZERO: Final = 0.0025
 """Prior standard deviation of a run's own sensor zero, part of the rated torque."""
+_SMOOTHING: Final = {"smoothing": 1, "smoothing_quartic": 2}
+"""Of a computed torque: how often it is differentiated twice."""
+_SMOOTHED: Final = 0.3
+"""Prior standard deviation of the part that its smoothing took of it at COMPUTED_HZ."""
 _SHARE: Final = {"smooth": 0.3, "viscous": 0.08, "coulomb": 0.02}
 """Prior standard deviations of a run's own friction, as parts of the joint's usual one (`usual_friction`)."""
 _TORSION_ZERO: Final = 25.0
@@ -272,12 +277,21 @@ _LEAST_VISCOUS: Final = 0.01
 LINE: Final = "line"
 
 
-def families(runs: Sequence[Sequence[JointSignals]], lines: Sequence[Line] = ()) -> list[Family]:
-    """Return the families of nuisances of these runs [run][joint], and of lines; scales are in proportion to the joint."""
+def families(
+    runs: Sequence[Sequence[JointSignals]], lines: Sequence[Line] = (), *, computed: bool = False
+) -> list[Family]:
+    """Return the families of nuisances of these runs [run][joint], and of lines; scales are in proportion to the joint.
+
+    A torque that is computed has no zero. It was smoothed instead, in a way that nobody states: to the fourth order of the
+    frequency, what a filter without delay takes are second and fourth derivatives.
+    """
     joints = [s.number for s in runs[0]]
     rated = {s.number: s.joint.rated_torque_nm for s in runs[0]}
     usual = {n: usual_friction([s for run in runs for s in run if s.number == n]) for n in joints}
-    out = [Family("zero", 0, _ZERO * min(rated.values()))]
+    if computed:
+        out = [Family(name, n, _SMOOTHED) for name in _SMOOTHING for n in joints]
+    else:
+        out = [Family("zero", 0, _ZERO * min(rated.values()))]
     out += [Family(name, n, part * usual[n][name]) for name, part in _SHARE.items() for n in joints]
     out += [Family("torsion_zero", n, _TORSION_ZERO * rated[n]) for n in joints]
     for line in lines:
@@ -302,10 +316,13 @@ def usual_friction(signals: Sequence[JointSignals]) -> dict[str, float]:
 
 def _nuisance(s: JointSignals, balance: str, family: Family) -> FloatArray | None:
     """Return the column of one family in one channel, None where it has none."""
-    if family.name == "zero":
-        return np.full(len(s.time_s), -1.0) * (s.per_torque if balance == MOTOR else 1.0)
-    if family.joint != s.number:
+    if family.joint not in {0, s.number}:
         return None
+    if family.name == "zero" or family.name in _SMOOTHING:
+        torque = s.reading_nm if family.name in _SMOOTHING else np.ones(len(s.time_s))
+        for _ in range(_SMOOTHING.get(family.name, 0)):
+            torque = second_difference(torque, s.time_s) / (2.0 * math.pi * COMPUTED_HZ) ** 2
+        return -torque * (s.per_torque if balance == MOTOR else 1.0)
     if family.name == LINE:
         if family.balance != balance:
             return None

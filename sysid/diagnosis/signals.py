@@ -134,7 +134,7 @@ class Line:
 
 
 COMPUTED_HZ: Final = 12.0
-"""Cutoff of the balances where the torque is computed, as its acceleration was smoothed; least cutoff of any torque."""
+"""Cutoff of the balances where the torque is computed; least cutoff of any torque."""
 _STATIC: Final = 1.0 / 3.0
 """Part of the frequency at which a link swings on its spring, up to which both balances are judged: there the spring follows
 the torque but for a tenth of it, whatever the stiffness is.

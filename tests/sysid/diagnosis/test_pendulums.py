@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Friction, Joint
@@ -312,6 +313,29 @@ def test_a_torque_that_is_computed_is_as_slow_as_its_acceleration() -> None:
         assert low <= getattr(true.friction, key) <= high
 
 
+def test_a_computed_torque_may_have_been_smoothed() -> None:
+    """By cubics over 0.1 s (Savitzky and Golay 1964), as programs for rigid bodies are given their accelerations: what
+    the torque lacks is no unbalance, inertia and torque constant that cancel one another.
+    """
+    rig = Rig(inertia_kgm2=1.2, rate_hz=250.0, current_noise_a=0.01, counts=2.0**14, seconds=16.0)
+    wrong = {"torque_constant_nm_per_a": 0.92, "rotor_inertia_kgm2": 1.25}
+    true = replace(ARM, **{name: factor * getattr(ARM, name) for name, factor in wrong.items()})
+    runs = []
+    for name, table in ramped(true, rig):
+        q = table.joints[1].motor_position_rad
+        assert q is not None
+        q = q / ARM.gear_ratio
+        a = signal.savgol_filter(q, 25, 3, deriv=2, delta=1.0 / rig.rate_hz)
+        torque = rig.inertia_kgm2 * a + rig.moment_nm * np.sin(q)
+        runs.append((name, RunTable(table.time_s, {1: replace(table.joints[1], torque_nm=torque)})))
+    found = diagnose(runs, {1: ARM}, Scope(known_references=frozenset({1})))
+    named = {c.name: c for c in found.causes}
+    assert named.keys() == {"torque_constant", "rotor_inertia"}
+    for effect, key in (("torque_constant", "torque_constant_nm_per_a"), ("rotor_inertia", "rotor_inertia_kgm2")):
+        low, high = named[effect].parameters[key].ci95
+        assert low <= getattr(true, key) <= high
+
+
 def ramped(true: Joint, rig: Rig) -> Runs:
     """Four speeds in both directions with ramps of 0.1 s between them."""
     out = []
@@ -323,9 +347,9 @@ def ramped(true: Joint, rig: Rig) -> Runs:
         wide = round(0.1 * rig.rate_hz)
         v = np.convolve(np.pad(v, wide, mode="edge"), np.ones(wide) / wide, "same")[wide:-wide]
         a = np.gradient(v, t)
-        q = np.cumsum(v) / rig.rate_hz
+        q = (np.cumsum(v) - 0.5 * v) / rig.rate_hz
         G = true.gear_ratio
-        tau = rig.inertia_kgm2 * a
+        tau = rig.inertia_kgm2 * a + rig.moment_nm * np.sin(q)
         current = (G**2 * true.rotor_inertia_kgm2 * a + tau + friction_of(true)(v, tau, G * q)) / (
             G * true.torque_constant_nm_per_a
         )
