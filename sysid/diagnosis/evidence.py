@@ -448,13 +448,6 @@ class Equations:
         log = 2.0 * float(np.sum(np.log(np.diag(lower)))) + float(np.sum(np.log(v)))
         return total[np.ix_(o, o)] - half.T @ half, log
 
-    def own(self, chosen: Set, mean: FloatArray, variances: Variances) -> FloatArray:
-        """Return the means of each recording's nuisances beside a set with these coefficients [r, N]."""
-        contrast = np.zeros(len(self._outer))
-        contrast[columns_of(self.entries, chosen)], contrast[-1] = -mean, 1.0
-        keep = self._positive(lambda e: e.beside(chosen)._reduced(variances)[2])
-        return np.array([cho_solve((lower, True), cross @ contrast) for lower, cross in keep])
-
     def expected(
         self, chosen: Set, variances: Variances, steps: int
     ) -> tuple[dict[object, float], float, Means]:

@@ -102,10 +102,6 @@ class Solution:
         wide.recorded = np.maximum(wide.recorded, np.repeat(off, [e.size for e in self.entries]))
         return wide.sets(self.variances, self.chosen).fit(self.chosen).covariance
 
-    def own(self, mean: FloatArray, chosen: Set) -> FloatArray:
-        """Return what each recording has of its own beside a set with these coefficients [r, N]."""
-        return self.equations.own(chosen, mean, self.variances)
-
 
 def transform_of(entries: Sequence[Entry], columns: int) -> FloatArray:
     """Return the weights of scaled coefficients of entries in the library's columns [P, E]."""

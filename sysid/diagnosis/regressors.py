@@ -29,7 +29,6 @@ from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.signals import COMPUTED_HZ, SLOWEST_RAD_S, Channel, JointSignals, Line
 from jtqd.sysid.diagnosis.smoothing import second_difference
-from jtqd.sysid.diagnosis.smoothing import second_difference
 
 BIN_S: Final = 0.005
 SAME_RATE: Final = 0.05

@@ -348,13 +348,6 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
     left = remaining(dataset, *present_of(solution))
     rest = unexplained_residual(left)
     predicting = effects_of(solution, prediction.chosen, prediction.mean)
-    if _largest(rest, limits_nm) > 1.0:
-        # the discrepancy has a part in the set's values, none in those that predict
-        own = solution.own(prediction.mean, prediction.chosen)[:, : len(dataset.families)]
-        other = remaining(dataset, predicting, own)
-        less = unexplained_residual(other)
-        if _largest(less, limits_nm) < _largest(rest, limits_nm):
-            left, rest = other, less
     total_nm2 = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + rest.energy_nm2()
     left_share = rest.energy_nm2() / max(total_nm2, 1e-30)
     unexplained = _unexplained(rest, held_nm(left), limits_nm, dataset, left_share)
@@ -387,11 +380,6 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
         predicts=tuple(predicting),
         next_experiment=_next(matter, effects, dataset),
     )
-
-
-def _largest(rest: Unexplained, limits_nm: Mapping[Channel, float]) -> float:
-    """Return the largest of what remains in parts of its limit."""
-    return max(rest.worst_nm.get(c, 0.0) / nm for c, nm in limits_nm.items())
 
 
 def _cause(
@@ -517,7 +505,7 @@ def entry_table(
             CandidateEvidence(
                 name,
                 joint,
-                cause.delta_evidence if cause else 2.0 * float(gains[best]),
+                cause.delta_evidence if cause else _brings(sets, chosen, best),
                 _minimum(sets.entries[best], smallest),
                 reason,
             )
@@ -533,6 +521,13 @@ def entry_table(
         rows.append(CandidateEvidence(name, first, math.nan, {}, reason))
     rows.sort(key=lambda r: -r.delta_bic if math.isfinite(r.delta_bic) else math.inf)
     return tuple(rows), tuple(lost)
+
+
+def _brings(sets: Sets, chosen: Set, k: int) -> float:
+    """Return twice the log evidence that an entry beyond the set brings, -inf where its slot is taken."""
+    if sets.entries[k].slot in {sets.entries[j].slot for j in chosen}:
+        return -math.inf
+    return 2.0 * (sets.fit(chosen | {k}).evidence - sets.fit(chosen).evidence)
 
 
 def _absent(effect: Effect, dataset: Dataset, scope: Scope) -> tuple[str, str | None]:

@@ -331,7 +331,10 @@ def test_a_computed_torque_may_have_been_smoothed() -> None:
     found = diagnose(runs, {1: ARM}, Scope(known_references=frozenset({1})))
     named = {c.name: c for c in found.causes}
     assert named.keys() == {"torque_constant", "rotor_inertia"}
-    for effect, key in (("torque_constant", "torque_constant_nm_per_a"), ("rotor_inertia", "rotor_inertia_kgm2")):
+    for effect, key in (
+        ("torque_constant", "torque_constant_nm_per_a"),
+        ("rotor_inertia", "rotor_inertia_kgm2"),
+    ):
         low, high = named[effect].parameters[key].ci95
         assert low <= getattr(true, key) <= high
 
