@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo hidden-effect docs deb release test test-here test-hidden test-guest test-native test-sanitized test-all mutants bench bench-kernel fuzz soak soak-exact lint style types format clean
+.PHONY: help setup demo hidden-effect docs deb release test test-here test-hidden test-guest test-native test-sanitized test-all mutants bench bench-kernel kernel-with-vcan fuzz soak soak-exact lint style types format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -24,11 +24,10 @@ hidden-effect: $(VENV)/.installed-analysis ## hide an effect in the emulated ben
 	$(BIN)/python -m examples.hidden_effect --effect torque_constant --bus none --out hidden --picture hidden/before_after.png
 
 test: style ## everything but the tests marked campaign
-	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
 	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part.
 	$(BIN)/python -m compileall -q daemon drivers estimator models sim_can sysid tests tools validation
 	@status=0; \
-	$(MAKE) --no-print-directory -k -j2 --output-sync=target test-here test-guest test-hidden types || status=$$?; \
+	$(MAKE) --no-print-directory -k -j2 --output-sync=target test-guest test-here test-hidden types || status=$$?; \
 	$(MAKE) --no-print-directory test-native || status=$$?; \
 	exit $$status
 
@@ -38,6 +37,8 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 HIDDEN := tests/validation tests/examples tests/sysid/batch
 HERE := not (campaign or socketcan or boots or native)
 SLOWEST := --durations=20 --durations-min=2
+# $(call MARKED,MARK|MARK): the files with a test so marked; a lane reads no others.
+MARKED = $(shell grep -rlE --include='test_*.py' 'mark\.($(1))\b' tests | sort)
 
 test-here:
 	$(ONE_THREAD) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN:%=--ignore=%)
@@ -45,15 +46,14 @@ test-here:
 test-hidden:
 	$(ONE_THREAD) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN)
 
-test-guest:
-	$(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign"
+test-guest: kernel-with-vcan
+	$(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign" $(call MARKED,socketcan|boots)
 
 # Loops of 1 kHz at the pace of this machine's clock: nothing beside them.
 test-native:
-	$(BIN)/python -m pytest $(SLOWEST) -m "native and not (campaign or socketcan or boots)"
+	$(BIN)/python -m pytest $(SLOWEST) -m "native and not (campaign or socketcan or boots)" $(call MARKED,native)
 
-test-all: lint ## everything: also the long tests, two releases that must be equal, the mutants, the sanitizers
-	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
+test-all: lint kernel-with-vcan ## everything: also the long tests, two releases that must be equal, the mutants, the sanitizers
 	$(BIN)/python -m pytest
 	$(MAKE) --no-print-directory test-sanitized
 
@@ -90,6 +90,9 @@ soak: $(VENV)/.installed-dev ## jtqd for 30 minutes with faults drawn at random
 
 soak-exact: $(VENV)/.installed-dev ## the same in the bench kernel: as much guest time as an hour gives
 	$(BIN)/python -m tests.slow.soak --exact --minutes 1440 --wall 3600
+
+kernel-with-vcan: $(VENV)/.installed-test
+	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
 
 bench-kernel: $(VENV)/.installed ## build the kernel with SocketCAN into the cache, once
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build

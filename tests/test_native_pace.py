@@ -1,10 +1,12 @@
 """The rule for tests at the machine's own pace: only stolen time excuses a failure, and never silently."""
 
+import re
 from itertools import count
 
 import pytest
 
 from tests.native_pace import NativePace
+from tests.paths import ROOT
 
 pytest_plugins = ["pytester"]
 
@@ -87,3 +89,10 @@ def test_an_unmarked_test_is_never_tried_again(pytester):
     result = pytester.inline_run("-p", "no:cacheprovider", plugins=[pace])
     assert len(result.listoutcomes()[2]) == 1
     assert pace.told == []
+
+
+def test_the_mark_of_a_lane_stands_in_the_file_of_its_tests():
+    """The Makefile gives a lane the files that name its mark: a test with a mark from elsewhere would be in none."""
+    named = re.compile(r"\bmark\.(socketcan|boots|native)\b|getattr\(pytest\.mark")
+    elsewhere = [path for path in (ROOT / "tests").rglob("*.py") if not path.name.startswith("test_")]
+    assert [path.name for path in elsewhere if named.search(path.read_text())] == []

@@ -117,6 +117,7 @@ def kernel():
         pytest.skip(str(error))
 
 
+@pytest.mark.boots
 @pytest.mark.usefixtures("kernel")
 def test_run_returns_status_and_streams_and_writes_only_to_out_dir(tmp_path, monkeypatch):
     work, out = tmp_path / "work here", tmp_path / "out, written"
@@ -133,6 +134,7 @@ def test_run_returns_status_and_streams_and_writes_only_to_out_dir(tmp_path, mon
     assert not list(work.iterdir())
 
 
+@pytest.mark.boots
 @pytest.mark.usefixtures("kernel")
 def test_time_out_kills_the_guest_and_says_so():
     # time travel with a clock-polling loop: the hang that docs/testing.md warns of
