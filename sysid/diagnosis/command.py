@@ -363,12 +363,12 @@ def _write(
     They are made in a directory beside first: what fails on the way leaves the earlier results as they were. Then what
     an earlier diagnosis wrote goes.
     """
-    from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE, motions_of
+    from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE
     from jtqd.sysid.diagnosis.report import render
 
     origin = {"sha256": sha256, "date": findings.provenance.date if findings.provenance else ""}
     experiment = findings.next_experiment or {}
-    texts = {file: table for file, (_, table) in motions_of(experiment).items()}
+    texts = dict(experiment.get("tables", {}))
     if experiment.get("plan"):
         texts[PLAN_FILE] = Plan.from_mapping(experiment["plan"], PLAN_FILE).to_yaml()
     texts[REPORT] = render(findings)

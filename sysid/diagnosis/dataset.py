@@ -54,7 +54,7 @@ from jtqd.sysid.diagnosis.signals import (
     with_one_sensor,
     without_held,
 )
-from jtqd.sysid.diagnosis.structure import View, frequency_lines, order_lines, sharpened
+from jtqd.sysid.diagnosis.structure import STRONG_LINE, View, frequency_lines, order_lines, sharpened
 from jtqd.sysid.runs.bad_samples import held_values, saturation_limits
 from jtqd.sysid.runs.channels import Channels
 
@@ -62,7 +62,6 @@ FEWEST_RUNS: Final = 2
 SHORTEST_MOVING_S: Final = 5.0
 SLOWEST_HZ: Final = 50.0
 ORDER_STEP_S: Final = 0.002
-STRONG_LINE: Final = 25.0
 _SIDELOBES: Final = 0.25
 _LOWEST_ORDER: Final = 0.7
 _MOST_LINES: Final = 4
@@ -70,17 +69,8 @@ _SAME_HZ: Final = 0.3
 _DRAWS: Final = 6
 """Fixed-point steps to the current that a file with effects draws."""
 _NAMED: Final = re.compile(r"(?P<of>.+) \((?P<piece>\d+) of (?P<all>\d+)\)")
-_ENDS: Final = 5
-"""Samples whose mean is the velocity at an end of a run."""
-_CUT_STEPS: Final = 3.0
-"""Sampling steps between two pieces that were cut apart without a loss."""
 _LOST_S: Final = 1.0
-"""Gap between stamps that go on, at most."""
-_SPEED_CHANGE: Final = 0.05
-"""Part of the range of velocities by which it may change over a cut."""
-_WARMER_K: Final = 0.6
-_AT_MOST_RAD: Final = 2e-3
-"""Joint side: by how much positions may differ from the integrated velocity."""
+"""Gap between the stamps of two pieces of one recording, at most: a recorder's restart takes longer."""
 
 SETTLED_S: Final = 0.1
 """After the stage went off: the current dies away, and what it twisted springs back. Left out at the other end too."""
@@ -90,7 +80,6 @@ DRIFT: Final = 5e-4
 """Of the rated torque over G Kt: what the zero of a current sensor may change by between the reading and the motion, a
 tenth of the usual relevance. All readings of a joint together are no more certain than this.
 """
-_BLOCK_S: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -287,27 +276,19 @@ def piece_notes(runs: Sequence[Sequence[JointSignals]]) -> list[str]:
 
 
 def _goes_on(before: Sequence[JointSignals], after: Sequence[JointSignals]) -> bool:
-    """Return whether every joint of `after` begins where it ends in `before`."""
-    step = before[0].step_s
+    """Return whether every joint of `after` begins where it ends in `before`: position, velocity and temperature change over
+    the cut by no more than they do in as many sampling steps of these runs.
+    """
     gap = float(after[0].time_s[0] - before[0].time_s[-1])
-    stamped = 0.0 < gap <= _LOST_S
-    gap = gap if stamped else step
-    moving = False
+    stamped, moving = 0.0 < gap <= _LOST_S, False
+    steps = 1.0 + (gap / before[0].step_s if stamped else 1.0)  # one for the ends of the filter
     for one, two in zip(before, after, strict=True):
-        a, b = one.state, two.state
-        speeds = [float(np.mean(a.velocity_rad_s[-_ENDS:])), float(np.mean(b.velocity_rad_s[:_ENDS]))]
-        reach = float(np.ptp(a.velocity_rad_s)) + float(np.ptp(b.velocity_rad_s))
-        short = gap <= _CUT_STEPS * step
-        if short and abs(speeds[1] - speeds[0]) > _SPEED_CHANGE * reach:
-            return False
-        moving = moving or min(map(abs, speeds)) > SLOWEST_RAD_S
-        travel = 0.5 * (speeds[0] + speeds[1]) * gap
-        off = abs(float(b.link_position_rad[0] - a.link_position_rad[-1]) - travel)
-        if off > _AT_MOST_RAD + 0.5 * abs(travel) + (0.0 if short else 0.25 * reach * gap):
-            return False
-        warm = float(b.temperature_c[0] - a.temperature_c[-1])
-        if np.isfinite(warm) and abs(warm) > _WARMER_K:
-            return False
+        for name in ("link_position_rad", "velocity_rad_s", "temperature_c"):
+            x, y = (np.asarray(getattr(s.state, name)) for s in (one, two))
+            if abs(y[0] - x[-1]) > steps * max(np.max(np.abs(np.diff(z))) for z in (x, y)):
+                return False
+        ends = one.state.velocity_rad_s[-1], two.state.velocity_rad_s[0]
+        moving = moving or min(map(abs, ends)) > SLOWEST_RAD_S
     return stamped or moving
 
 
@@ -481,19 +462,19 @@ def reading(s: JointSignals) -> Reading | None:
     if s.off is None or not s.off.any():
         return None
     edge, least = round(SETTLED_S / s.step_s), round(SHORTEST_S / s.step_s)
-    block = max(1, round(_BLOCK_S / s.step_s))
     bounds = np.flatnonzero(np.diff(np.concatenate(([0], s.off.astype(np.int8), [0]))))
-    means: list[float] = []
-    for first, last in zip(bounds[::2] + edge, bounds[1::2] - edge, strict=True):
-        if last - first >= least:
-            many = (last - first) // block
-            means += s.current_a[first : first + many * block].reshape(many, block).mean(axis=1).tolist()
-    if not means:
+    rests = [
+        s.current_a[first:last]
+        for first, last in zip(bounds[::2] + edge, bounds[1::2] - edge, strict=True)
+        if last - first >= least
+    ]
+    if not rests:
         return None
-    noise = float(np.std(means, ddof=1)) / np.sqrt(len(means)) if len(means) > 1 else 0.0
+    current = np.concatenate(rests)
+    noise = float(np.std(current)) / math.sqrt(len(current))
     known = sum(unpowered(EFFECTS[e.name], e.parameters, s.joint) for e in s.joint.effects)
     rated_a = s.joint.rated_torque_nm / s.nm_per_a
-    return Reading(float(np.mean(means)) - known, float(noise), DRIFT * rated_a)
+    return Reading(float(np.mean(current)) - known, noise, DRIFT * rated_a)
 
 
 def readings(signals: Sequence[Sequence[JointSignals]]) -> list[Readings]:

@@ -215,7 +215,6 @@ class Gap:
     balance: str
     rmse_nm: float
     noise_floor_nm: float
-    floor_from: str  # "repeated runs" or "what no effect and no map can explain"
     localisation: tuple[Place, ...]
 
 
@@ -280,8 +279,7 @@ class OutlierRun:
     """A run that differs from all others and is not used: what ("gain", "zero", "delay") of which column differs by `value`
     from the mean of the others, whose standard deviation is `usual`. others: deviations that fit nearly as well.
 
-    unit: "" for a gain (0.07: it reads 7 % more; -2: the opposite), "of rated" (torque; of a current, its torque),
-    "s" (late).
+    unit: "" for a gain (0.07: it reads 7 % more), "of rated" (torque; of a current, its torque), "s" (late).
     """
 
     run: str
@@ -303,8 +301,6 @@ class OutlierRun:
             f"{verb} {abs(scale * self.value):.3g} {unit} {more if self.value > 0.0 else less} than in the other runs, "
             f"which differ by {scale * self.usual:.2g} {unit} among themselves"
         )
-        if self.what == "gain" and self.value < -1.0:
-            found = f"has the opposite direction of that in the other runs, {-1.0 - self.value:.3g} times as large"
         return f"{self.run}: {channel} {found}{either}: a matter of this run, which is not used"
 
 
@@ -398,7 +394,7 @@ def to_mapping(
     no_gap: dict[str, Any] = {"joint": None, "rmse_nm": None, "noise_floor_nm": None, "localisation": []}
     experiment = findings.next_experiment
     if experiment is not None:  # the positions of a motion are a file of their own
-        experiment = {key: value for key, value in experiment.items() if key not in {"table", "tables"}}
+        experiment = {key: value for key, value in experiment.items() if key != "tables"}
     mapping = {
         "schema": SCHEMA,
         "verdict": findings.verdict,

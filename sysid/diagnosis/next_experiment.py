@@ -96,8 +96,8 @@ def next_experiment(
     signals: Sequence[JointSignals] = (),
 ) -> dict[str, Any]:
     """Return what would settle it: {"why": text, "plan": mapping of jtq.plan/1} for two joints on a towing bench, and
-    {"why": text, "plan": None, "motion": ..} for one joint, which is moved alone. Three and more are an arm: each gets a
-    motion of its own (`each_joint`).
+    {"why": text, "plan": None, "motions": {file: motion}, "tables": {file: CSV}} for one joint, which is moved alone. Three
+    and more are an arm: each gets a motion of its own (`each_joint`).
 
     classes: names of effects that the runs cannot distinguish, one sequence per class; one name alone is to be made visible.
     joints: files of the joints in the runs; why: what the diagnosis states before it; temperature: whether the runs have
@@ -120,24 +120,21 @@ def next_experiment(
 
 
 def each_joint(experiments: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the experiments of joints that are moved one by one, by their numbers, as one.
-
-    A single one is returned as it is; several are {"why": all of them, "plan": None, "motion": None, "joints": [{"joint",
-    "why", "motion"}, ..], "tables": {number: CSV}}, tables for those with a motion. Raises ValueError without any.
+    """Return the experiments of joints that are moved one by one, by their numbers, as one: a file of its own for each joint
+    that has a motion. Raises ValueError without any.
     """
     if not experiments:
         raise ValueError("joints: found none, expected at least one")
     if len(experiments) == 1:
         [only] = experiments.values()
         return dict(only)
-    ordered = sorted(experiments.items())
-    return {
-        "why": " ".join(f"Joint {n}: {each['why'].replace(f' {_TOWING}', '')}" for n, each in ordered),
-        "plan": None,
-        "motion": None,
-        "joints": [{"joint": n, "why": each["why"], "motion": each.get("motion")} for n, each in ordered],
-        "tables": {n: each["table"] for n, each in ordered if each.get("table")},
-    }
+    made: dict[str, Any] = {"why": "", "plan": None, "motions": {}, "tables": {}}
+    for n, each in sorted(experiments.items()):
+        made["why"] += f"Joint {n}: {each['why'].replace(f' {_TOWING}', '')} "
+        for kind in ("motions", "tables"):
+            for value in each.get(kind, {}).values():
+                made[kind][f"next_experiment.joint{n}.motion.csv"] = value
+    return made | {"why": made["why"].strip()}
 
 
 def _of_one_joint(
@@ -149,7 +146,7 @@ def _of_one_joint(
     try:
         room = joint_range_of(joint, signals)
     except NoRangeError as reason:
-        return {"why": " ".join([*parts, f"No motion is planned: {reason}."]), "plan": None, "motion": None}
+        return {"why": " ".join([*parts, f"No motion is planned: {reason}."]), "plan": None}
     made = joint_motions(kinds, room)
     minutes = sum(motion.duration_s for motion in made) / 60.0
     needed = (
@@ -174,7 +171,8 @@ def _of_one_joint(
         "torque_nm": room.torque_nm,
         "runs": [{"name": m.name, "what": m.what, "duration_s": m.duration_s} for m in made],
     }
-    return {"why": " ".join(parts), "plan": None, "motion": motion, "table": csv_text(made)}
+    files = {"motions": {MOTION_FILE: motion}, "tables": {MOTION_FILE: csv_text(made)}}
+    return {"why": " ".join(parts), "plan": None, **files}
 
 
 def _begun(classes: Sequence[Sequence[str]], why: str, done: Mapping[str, str]) -> list[str]:
@@ -247,13 +245,3 @@ def _calm_stretch(
     k = int(np.argmax(ends - starts))
     first, last = float(edges[starts[k]]), float(edges[ends[k]])
     return (first, last) if last - first >= _LEAST_TRAVEL_RAD else None
-
-
-def motions_of(experiment: Mapping[str, Any]) -> dict[str, tuple[Mapping[str, Any], str]]:
-    """Return each motion of an experiment and its table by the name of its file."""
-    tables = experiment.get("tables") or {}
-    made = [(MOTION_FILE, experiment.get("motion"), experiment.get("table", ""))]
-    for each in experiment.get("joints", ()):
-        n = each["joint"]
-        made.append((f"next_experiment.joint{n}.motion.csv", each["motion"], tables.get(n, "")))
-    return {file: (motion, table) for file, motion, table in made if motion}

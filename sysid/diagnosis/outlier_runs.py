@@ -9,11 +9,11 @@ run's own: a loose plug, a sensor zeroed again, another filter of the drive.
    the usual changes u_r from run to run (`regressors.families`), until none lowers BIC by ENTER.
 2. A run is an outlier where a deviation was chosen and, with the chosen effects fitted too, differs from the mean of the
    other runs by more than FAR standard deviations. These hold the run's own error and the spread of the others, mixed with
-   the usual one (USUAL, worth four runs). Of a gain only what is beyond its `echo` counts: a channel that is all noise
-   explains its own noise in the residual.
-3. The run's squared error per row exceeds the median of the others; this deviation must explain most of that excess
-   (`_MOST`). A delay of the current can imitate a brake that drags or a cover that rubs in one run, but explains only some
-   per cent: such a run is no outlier, and its disturbance must stay in the data.
+   the usual one (USUAL, worth `limits.RUNS_COUNT` runs). Of a gain only what is beyond its `echo` counts: a channel that is
+   all noise explains its own noise in the residual.
+3. The run's squared error per row exceeds the median of the others; this deviation must explain most of that excess.
+   A delay of the current can imitate a brake that drags or a cover that rubs in one run, but explains only some per cent:
+   such a run is no outlier, and its disturbance must stay in the data.
 
 Of two runs none can be called the outlier. One run at a time is taken away, fewer than half of all (`diagnose`).
 """
@@ -32,6 +32,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import MOTOR
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import JointName, OutlierRun, joint_text
+from jtqd.sysid.diagnosis.limits import RUNS_COUNT
 from jtqd.sysid.diagnosis.regressors import (
     EffectCandidate,
     RunData,
@@ -46,24 +47,15 @@ from jtqd.sysid.diagnosis.signals import JointSignals
 
 ENTER: Final = 10.0
 """BIC difference: very strong evidence on the scale of Kass and Raftery 1995, J. Am. Stat. Assoc. 90."""
-_RIDGE: Final = 1e-10
 FEWEST: Final = 3
 """Recordings among which one can be an outlier."""
 FAR: Final = 5.0
+"""Standard deviations."""
 USUAL: Final[Mapping[str, float]] = {"gain": 0.01, "zero": 0.004, "delay": 5e-4}
 """What runs usually differ by: a part, a part of the rated torque (of a current, its torque), seconds."""
 UNITS: Final[Mapping[str, str]] = {"gain": "", "zero": "of rated", "delay": "s"}
-_USUAL_RUNS: Final = 4.0
-_FREE: Final = 100.0
-"""Deviations that are asked for are free up to so many times the usual."""
-_PASSES: Final = 2
 _AS_GOOD: Final = 0.8
-"""Part of the drop of the squared error that another deviation of the same run must reach to be named beside."""
-_MOST: Final = 0.5
-"""Part of what sets a run apart that its deviation must explain."""
-_MOST_COLUMNS: Final = 24
-_NOTHING: Final = 1e-6
-"""Part of what a channel reads that is nothing of the true value."""
+"""Part of the drop of the squared error from which another deviation of the same run is listed as an alternative."""
 
 
 class Deviation(NamedTuple):
@@ -76,66 +68,61 @@ class Deviation(NamedTuple):
 
 def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
     """Return places in dataset.runs of the run (or its pieces) that differs most from all others, and how; None: none."""
-    pieces = np.array(dataset.recordings, np.intp)
-    count = int(pieces.max()) + 1
-    if count < FEWEST:
+    if max(dataset.recordings) + 1 < FEWEST:
         return None
     kinds = deviations(dataset.joints)
-    both = list(zip(dataset.runs, dataset.signals, strict=True))
-    runs = [_with_columns(run, signals, kinds, len(dataset.families)) for run, signals in both]
-    columns = dataset.candidates[-1].columns.stop if dataset.candidates else 0
-    sigma = np.array([family.sigma for family in dataset.families])
-    echoes = np.zeros((count, len(kinds)))
-    for place, (run, signals) in zip(pieces, both, strict=True):
-        echoes[place] = np.maximum(echoes[place], [echo(kind, signals, run.samples) for kind in kinds])
-    leave = gain_columns(dataset.candidates)
-    for _ in range(_PASSES):
-        # the noise is first what nothing explains, then what the chosen effects leave
-        residuals = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
-        noise = noise_of_channels(residuals, dataset.step_s)
-        sums = [run_sums(run, noise, columns, len(sigma) + len(kinds)) for run in runs]
-        grams = np.zeros((count, *sums[0].gram.shape))
-        np.add.at(grams, pieces, np.array([s.gram for s in sums]))
-        each = np.bincount(pieces, [s.rows for s in sums]).astype(np.float64)
-        comparison = Comparison(without_days(grams, columns, sigma), columns, echoes)
-        chosen, off = comparison.chosen(dataset.candidates, math.log(max(float(each.sum()), 10.0)))
-        far = []
-        for at in off:
-            size = comparison.far(chosen, at, kinds)
-            if size is not None and comparison.explains_what_is_apart(chosen, off, at, each):
-                far.append((comparison.drop(chosen, off, *at), at, size))
-        if not far:
-            return None
-        leave = set(range(columns)) - set(chosen)
+    comparison = compared(dataset, kinds)
+    chosen, off = comparison.chosen(dataset.candidates)
+    far = []
+    for at in off:
+        found = comparison.far(chosen, at, kinds)
+        if found is not None and comparison.explains_what_is_apart(chosen, off, at):
+            far.append((comparison.drop(chosen, off, *at), at, found))
+    if not far:
+        return None
     most, (r, k), (apart, spread) = max(far)
     others = tuple(
         f"{o.what} of {o.channel} of {joint_text(o.joint)}"
         for j, o in enumerate(kinds)
         if j != k and comparison.drop(chosen, off, r, j) >= _AS_GOOD * most
     )
-    places = [int(p) for p in np.flatnonzero(pieces == r)]
+    places = [place for place, piece in enumerate(dataset.recordings) if piece == r]
     kind, name = kinds[k], dataset.runs[places[0]].name
     if kind.what == "gain" and kind.channel == "torque_nm":
-        apart = of_truth(apart)
+        apart /= 1.0 - apart  # of the true value: g of it is g / (1 + g) of what was read
     return places, OutlierRun(name, *kind, apart, spread, UNITS[kind.what], others)
 
 
-def of_truth(gain: float) -> float:
-    """Return by what part of the true value a channel is off that is off by the part `gain` of what it reads.
-
-    The columns are made of what was read: g of the true value is g / (1 + g) of that; the other direction (-2) is 2 of it.
-    """
-    left = 1.0 - gain
-    return gain / (left if abs(left) > _NOTHING else _NOTHING)
+def compared(dataset: Dataset, kinds: Sequence[Deviation]) -> Comparison:
+    """Return the comparison of all recordings; the noise is what nothing explains."""
+    pieces, families = np.array(dataset.recordings, np.intp), len(dataset.families)
+    both = list(zip(dataset.runs, dataset.signals, strict=True))
+    runs = [_with_columns(run, signals, kinds, families) for run, signals in both]
+    leave = gain_columns(dataset.candidates)
+    residuals = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
+    noise = noise_of_channels(residuals, dataset.step_s)
+    columns = dataset.candidates[-1].columns.stop if dataset.candidates else 0
+    sums = [run_sums(run, noise, columns, families + len(kinds)) for run in runs]
+    grams = np.zeros((int(pieces.max()) + 1, *sums[0].gram.shape))
+    np.add.at(grams, pieces, np.array([s.gram for s in sums]))
+    rows = np.bincount(pieces, [s.rows for s in sums]).astype(np.float64)
+    echoes = np.zeros((len(grams), len(kinds)))
+    np.maximum.at(
+        echoes, pieces, [[echo(kind, signals, run.samples) for kind in kinds] for run, signals in both]
+    )
+    sigma = np.array([family.sigma for family in dataset.families])
+    return Comparison(without_days(grams, columns, sigma), rows, columns, echoes)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Normal equations of every run over effects, deviations and residual [r, P + K + 1, same]; columns: P; echoes: of every
-    run's deviations [r, K].
+    """Normal equations of every run over effects, deviations and residual [r, P + K + 1, same], and its rows [r].
+
+    columns: P; echoes: of every run's deviations [r, K].
     """
 
     runs: FloatArray
+    rows: FloatArray
     columns: int
     echoes: FloatArray
 
@@ -158,11 +145,10 @@ class Comparison:
         """Return the column of deviation k of run r in `total`."""
         return self.columns + r * self.kinds + k
 
-    def chosen(
-        self, candidates: Sequence[EffectCandidate], log_n: float
-    ) -> tuple[list[int], list[tuple[int, int]]]:
+    def chosen(self, candidates: Sequence[EffectCandidate]) -> tuple[list[int], list[tuple[int, int]]]:
         """Return the columns of the effects, and the deviations (run, kind), that are there: added one by one."""
         own = [(r, k) for r in range(len(self.runs)) for k in range(self.kinds)]
+        log_n = math.log(max(float(self.rows.sum()), 10.0))
         price = log_n + 2.0 * math.log(len(own))
         blocks: list[tuple[list[int], EffectCandidate | tuple[int, int], float]] = [
             (list(c.columns), c, c.size * log_n) for c in candidates if not c.effect.scales_all
@@ -170,7 +156,7 @@ class Comparison:
         blocks += [([self.place(*at)], at, price) for at in own]
         here: list[int] = []
         off: list[tuple[int, int]] = []
-        while blocks and len(here) < _MOST_COLUMNS:
+        while blocks:
             before = explained(self.total, here)
             worth = [explained(self.total, [*here, *block]) - before - cost for block, _, cost in blocks]
             if max(worth) < ENTER:
@@ -192,9 +178,9 @@ class Comparison:
         return explained(self.total, [*beside, self.place(r, k)]) - explained(self.total, beside)
 
     def explains_what_is_apart(
-        self, chosen: Sequence[int], off: Sequence[tuple[int, int]], at: tuple[int, int], rows: FloatArray
+        self, chosen: Sequence[int], off: Sequence[tuple[int, int]], at: tuple[int, int]
     ) -> bool:
-        """Return whether a deviation is most of what sets its run apart beside all else that was chosen; rows: per run."""
+        """Return whether a deviation is most of what sets its run apart beside all else that was chosen."""
         beta, _ = solve(self.total, [*chosen, *(self.place(*one) for one in off)])
         effects = np.append(-beta[: len(chosen)], 1.0)
 
@@ -204,21 +190,20 @@ class Comparison:
             right = self.runs[r][free[:, None], fixed] @ effects
             whole = float(effects @ self.runs[r][fixed[:, None], fixed] @ effects)
             gram = self.runs[r][free[:, None], free]
-            return (whole - float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])) / float(rows[r])
+            return (whole - float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])) / float(self.rows[r])
 
         own = {r: [k for q, k in off if q == r] for r in range(len(self.runs))}
         usual = float(np.median([square(r, own[r]) for r in own if r != at[0]]))
         without, with_it = square(at[0], [k for k in own[at[0]] if k != at[1]]), square(at[0], own[at[0]])
-        return without - with_it > _MOST * (without - usual)
+        return without - with_it > 0.5 * (without - usual)
 
     def far(
         self, chosen: Sequence[int], at: tuple[int, int], kinds: Sequence[Deviation]
     ) -> tuple[float, float] | None:
         """Return by how much a run is apart from the others, and their spread, where it is far from them."""
         r, k = at
-        usual = USUAL[kinds[k].what]
-        values, errors = own_deviations(self.runs, chosen, self.columns + k, _FREE * usual)
-        apart, spread = apart_from_others(values, r, usual)
+        values, errors = own_deviations(self.runs, chosen, self.columns + k)
+        apart, spread = apart_from_others(values, r, USUAL[kinds[k].what])
         least = FAR * float(np.hypot(spread, errors[r])) + float(self.echoes[r, k])
         return (apart, spread) if abs(apart) > least else None
 
@@ -231,22 +216,15 @@ def deviations(joints: Mapping[int, object]) -> list[Deviation]:
 
 def column(kind: Deviation, s: JointSignals, balance: str) -> FloatArray | None:
     """Return what one unit of a deviation leaves in a balance of one joint [n], Nm; None: nothing."""
-    state, joint = s.state, s.joint
-    if kind.channel == "current_a":
-        if kind.joint != s.number or balance != MOTOR:
-            return None
-        made = {
-            "gain": s.nm_per_a * state.current_a,
-            "zero": np.full(len(s.time_s), joint.rated_torque_nm),
-            "delay": -s.nm_per_a * state.current_rate_a_s,
-        }
-        return np.asarray(made[kind.what])
-    made = {
-        "gain": -state.torque_nm,
-        "zero": np.full(len(s.time_s), -joint.rated_torque_nm),
-        "delay": state.torque_rate_nm_s,
-    }
-    return np.asarray(made[kind.what] * (s.per_torque if balance == MOTOR else 1.0))
+    state, rated = s.state, np.full(len(s.time_s), s.joint.rated_torque_nm)
+    if kind.channel == "torque_nm":
+        made = {"gain": -state.torque_nm, "zero": -rated, "delay": state.torque_rate_nm_s}
+        return np.asarray(made[kind.what] * (s.per_torque if balance == MOTOR else 1.0))
+    if kind.joint != s.number or balance != MOTOR:
+        return None
+    per_a = s.nm_per_a
+    made = {"gain": per_a * state.current_a, "zero": rated, "delay": -per_a * state.current_rate_a_s}
+    return np.asarray(made[kind.what])
 
 
 def echo(kind: Deviation, signals: Sequence[JointSignals], samples: float) -> float:
@@ -268,8 +246,7 @@ def _with_columns(
     for channel, d in run.channels.items():
         s = of[channel.joint]
         made = [(families + k, column(kind, s, channel.balance)) for k, kind in enumerate(kinds)]
-        there = [(k, c) for k, c in made if c is not None]
-        numbers, columns = seen_in_bins(s, there, run.samples)
+        numbers, columns = seen_in_bins(s, [(k, c) for k, c in made if c is not None], run.samples)
         channels[channel] = replace(
             d, nuisances=np.hstack((d.nuisances, columns)), families=np.concatenate((d.families, numbers))
         )
@@ -287,11 +264,9 @@ def without_days(grams: FloatArray, columns: int, sigma: FloatArray) -> FloatArr
     return np.asarray(grams[:, rest[:, None], rest] - cross @ inner @ cross.transpose(0, 2, 1))
 
 
-def own_deviations(
-    runs: FloatArray, chosen: Sequence[int], at: int, free: float
-) -> tuple[FloatArray, FloatArray]:
+def own_deviations(runs: FloatArray, chosen: Sequence[int], at: int) -> tuple[FloatArray, FloatArray]:
     """Return the deviation in column `at` of every run [r], estimated beside the chosen columns in common, and its standard
-    error as a difference from the mean of the others [r]; free: prior standard deviation.
+    error as a difference from the mean of the others [r].
     """
     count, shared = len(runs), len(chosen)
     common = np.array(chosen, np.intp)
@@ -301,7 +276,7 @@ def own_deviations(
     gram[:shared, size] = runs[:, common, -1].sum(axis=0)
     for place, run in enumerate(runs, shared):
         gram[:shared, place] = gram[place, :shared] = run[common, at]
-        gram[place, place] = run[at, at] + 1.0 / free**2
+        gram[place, place] = run[at, at]
         gram[place, size] = run[at, -1]
     solution, covariance = solve(gram, range(size))
     contrast = (count * np.eye(count) - np.ones((count, count))) / (count - 1.0)
@@ -310,12 +285,10 @@ def own_deviations(
 
 
 def apart_from_others(own: FloatArray, r: int, usual: float) -> tuple[float, float]:
-    """Return by how much run r differs from the mean of the others, and their standard deviation; `usual` counts as
-    _USUAL_RUNS runs.
-    """
+    """Return by how much run r differs from the mean of the others, and their standard deviation."""
     others = np.delete(own, r)
-    squares = float(np.sum((others - others.mean()) ** 2)) + _USUAL_RUNS * usual**2
-    return float(own[r] - others.mean()), float(np.sqrt(squares / (len(others) + _USUAL_RUNS)))
+    squares = float(np.sum((others - others.mean()) ** 2)) + RUNS_COUNT * usual**2
+    return float(own[r] - others.mean()), math.sqrt(squares / (len(others) + RUNS_COUNT))
 
 
 def solve(total: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
@@ -323,7 +296,7 @@ def solve(total: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, FloatA
     at = np.array(columns, np.intp)
     gram = total[at[:, None], at]
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(gram), 1e-30))
-    scaled = gram * scale[:, None] * scale + _RIDGE * np.eye(len(at))
+    scaled = gram * scale[:, None] * scale + 1e-10 * np.eye(len(at))
     covariance = np.linalg.inv(scaled) * scale[:, None] * scale
     return covariance @ total[at, -1], covariance
 

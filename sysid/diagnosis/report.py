@@ -39,7 +39,7 @@ from jtqd.sysid.diagnosis.findings import (
     file_values,
     priors,
 )
-from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE, motions_of
+from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE
 from jtqd.sysid.planner.experiments import EXPERIMENTS
 from jtqd.sysid.report import page
 from jtqd.sysid.report.numbers import (
@@ -420,9 +420,6 @@ def render(findings: Findings) -> str:
         "gains": {each.run: each for each in findings.gain.runs} if findings.gain else {},
         "next": findings.next_experiment,
         "plan_file": PLAN_FILE,
-        "motions": [
-            (file, motion) for file, (motion, _) in motions_of(findings.next_experiment or {}).items()
-        ],
     }
     filters: dict[str, Callable[..., str]] = {
         "number": number,

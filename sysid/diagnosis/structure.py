@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
-from scipy import signal
+from scipy import linalg, signal
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR
@@ -49,8 +49,10 @@ ORDERS: Final = np.arange(0.3, 10.0, 0.04)
 _HZ: Final = (2.0, 40.0)
 AR_ORDER: Final = 24
 """Of the autoregression."""
-_LINE: Final = 25.0
+STRONG_LINE: Final = 25.0
 """Power of a line against the median of its neighbourhood."""
+_PEAK: Final = 8.0
+"""The same of a peak that may be one: noise has one in some thousand bins (exp(-8))."""
 _FEWEST_TURNS: Final = 8.0
 _FAR: Final = 60.0
 """Energy of a moment against the median: whitened Gaussian noise over ten samples never reaches a twentieth of it, the mean
@@ -307,7 +309,7 @@ def lines(balance: Balance, parts: Sequence[FloatArray]) -> list[View]:
     runs, step_s, residual = balance.runs, balance.step_s, {balance.channel: parts}
     out = []
     for found in (*order_lines(runs, residual, step_s), *frequency_lines(runs, residual, step_s)):
-        if found.ratio > _LINE and 0.5 * found.amplitude_nm**2 > balance.least_nm2:
+        if found.ratio > STRONG_LINE and 0.5 * found.amplitude_nm**2 > balance.least_nm2:
             line = sharpened(found, runs, parts, step_s)
             energy = 0.5 * line.amplitude_nm**2
             wave = _wave(line, balance, parts)
@@ -346,7 +348,7 @@ def order_lines(
     for channel, parts in residuals.items():
         power, weight = _order_power(runs, channel, parts, orders, 2 * _block(step_s))
         if weight >= 4:
-            out += _peaks(Line(channel, 0.0, 0.0, 8.0), orders, power, 30)
+            out += _peaks(Line(channel, 0.0, 0.0, 0.0), orders, power, 30)
     return sorted(out, key=lambda line: -line.ratio)
 
 
@@ -368,7 +370,7 @@ def frequency_lines(
                     piece = np.where(good, piece - np.nanmean(piece), 0.0)
                     powers.append(np.abs(np.fft.rfft(piece * shape) / shape.sum()) ** 2)
         if len(powers) >= 4:
-            out += _peaks(Line(channel, 0.0, 0.0, 12.0, "Hz"), hz, np.mean(powers, axis=0), 12)
+            out += _peaks(Line(channel, 0.0, 0.0, 0.0, "Hz"), hz, np.mean(powers, axis=0), 12)
     out = [line for line in out if _HZ[0] < line.order < min(_HZ[1], 0.4 / step_s)]
     return sorted(out, key=lambda line: -line.ratio)
 
@@ -393,16 +395,16 @@ def _order_power(
     return power / max(weight, 1), weight
 
 
-def _peaks(least: Line, at: FloatArray, power: FloatArray, near: int) -> list[Line]:
-    """Return local maxima that have the ratio of `least` to the median of `near` neighbours on either side; the amplitude is
-    that of a wave of constant size.
+def _peaks(of: Line, at: FloatArray, power: FloatArray, near: int) -> list[Line]:
+    """Return the local maxima that stand out of `near` neighbours on either side, as lines of the channel and unit of `of`;
+    the amplitude is that of a wave of constant size.
     """
     out = []
     for k in (np.flatnonzero((power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])) + 1).tolist():
         usual = float(np.median(power[max(0, k - near) : k + near + 1])) + 1e-12
-        if power[k] > least.ratio * usual:
+        if power[k] > _PEAK * usual:
             size, ratio = 2.0 * float(np.sqrt(power[k] - usual)), float(power[k]) / usual
-            out.append(replace(least, order=float(at[k]), amplitude_nm=size, ratio=ratio))
+            out.append(replace(of, order=float(at[k]), amplitude_nm=size, ratio=ratio))
     return out
 
 
@@ -432,33 +434,11 @@ def sharpened(line: Line, runs: Sequence[RunData], parts: Sequence[FloatArray], 
 
 
 def autoregression(stretches: Sequence[FloatArray], order: int = AR_ORDER) -> FloatArray:
-    """Return a [order]: x_t = sum a_k x_{t-k} + e, by Yule-Walker over series with NaN for gaps (Levinson)."""
-    covariance = np.zeros(order + 1)
-    for x in stretches:
-        good = np.isfinite(x)
-        y = np.where(good, x, 0.0)
-        for lag in range(min(order + 1, len(y))):
-            covariance[lag] += float(y[lag:] @ y[: len(y) - lag])
-    counts = np.array(
-        [
-            sum(int(np.sum(np.isfinite(x[k:]) & np.isfinite(x[: len(x) - k]))) for x in stretches)
-            for k in range(order + 1)
-        ],
-        np.float64,
-    )
-    c = covariance / np.maximum(counts, 1.0)
-    c[0] *= 1.0 + 1e-6
-    a = np.zeros(order)
-    error = c[0]
-    for k in range(order):
-        if error <= 0.0:
-            break
-        reflection = (c[k + 1] - float(a[:k] @ c[k:0:-1])) / error
-        if abs(reflection) >= 1.0:
-            break
-        a[:k], a[k] = a[:k] - reflection * a[:k][::-1], reflection
-        error *= 1.0 - reflection * reflection
-    return a
+    """Return a [order]: x_t = sum a_k x_{t-k} + e, by Yule-Walker over series with NaN for gaps."""
+    lags = [np.concatenate([x[k:] * x[: len(x) - k] for x in stretches]) for k in range(order + 1)]
+    covariance = np.array([np.nansum(x) / max(np.isfinite(x).sum(), 1) for x in lags])
+    covariance[0] = covariance[0] * (1.0 + 1e-6) or 1.0
+    return np.asarray(linalg.solve_toeplitz(covariance[:-1], covariance[1:]))
 
 
 def whiten(x: FloatArray, a: FloatArray) -> FloatArray:

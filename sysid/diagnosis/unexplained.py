@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations, pairwise
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -25,8 +25,6 @@ from jtqd.sysid.diagnosis.structure import AXES, Balance, View, autoregression, 
 
 _MOST_OF_THE_TIME: Final = 0.1
 """What takes more of the time than this is no event but a condition."""
-_SAME: Final = 0.02
-"""Part of their rms by which velocities of repeated runs differ at most; loads by five times as much."""
 _TRACE_POINTS: Final = 4000
 QUADRANT_NAMES: Final = ("v+ load+", "v+ load-", "v- load+", "v- load-")
 _SHARED: Final = 5.0
@@ -218,13 +216,14 @@ def channel_gaps(left: Remaining, found: Unexplained, matters: bool) -> tuple[Ga
     out = []
     for channel, balance in found.balances.items():
         x, rmse = shown[channel], _rms(_raw(left.dataset, channel))
-        floor, origin = _floor(left, channel)
-        floor = min(floor, rmse)  # changes from run to run that work against each other are not noise
+        floor = min(
+            _floor(left, channel), rmse
+        )  # changes from run to run that work against each other are not noise
         noise = _rms(left.dataset.unexplained[channel])
         views = found.views.get(channel, ()) if matters else pursue(balance, x)
         ranked = [_places(v, x, noise, max(rmse**2 - noise**2, 1e-30)) for v in views]
         places = (*(each[0] for each in ranked), *(p for each in ranked for p in each[1:]))
-        out.append(Gap(channel.joint, channel.balance, rmse, floor, origin, places))
+        out.append(Gap(channel.joint, channel.balance, rmse, floor, places))
     if matters:  # what is not explained comes first, wherever the gap is largest
         energy = found.by_channel()
         return tuple(sorted(out, key=lambda g: -energy.get(Channel(g.joint, g.balance), 0.0)))
@@ -271,39 +270,14 @@ def _raw(dataset: Dataset, channel: Channel) -> Parts:
     return [x - np.nanmean(x) for x in parts] if channel.balance == TORSION else parts
 
 
-def _floor(left: Remaining, channel: Channel) -> tuple[float, str]:
-    """Return the noise floor [Nm] and where it was taken from."""
-    repeats = _repeats(left.dataset, channel)
-    if repeats is not None:
-        return repeats, "repeated runs"
+def _floor(left: Remaining, channel: Channel) -> float:
+    """Return the noise floor [Nm]: what no effect explains, and run-to-run variation."""
     drift = []
     for d, u in zip(left.dataset.of(channel), left.own_changes, strict=True):
         part = (d.nuisances @ u[d.families])[d.valid]
         drift.append(part - part.mean() if channel.balance == TORSION and len(part) else part)
     square = float(np.mean(np.concatenate(drift) ** 2)) if any(map(len, drift)) else 0.0
-    rms = float(np.hypot(_rms(left.dataset.unexplained[channel]), np.sqrt(square)))
-    return rms, "what no effect explains, and run-to-run variation"
-
-
-def _repeats(dataset: Dataset, channel: Channel) -> float | None:
-    """Return rms of half the difference of repeated runs times sqrt 2 [Nm]; None without repetitions."""
-    found = []
-    for one, two in combinations(dataset.runs, 2):
-        if _alike(one.axes[channel.joint], two.axes[channel.joint]):
-            x, y = one.channels[channel], two.channels[channel]
-            d = (x.residual - y.residual)[x.valid & y.valid]
-            found.append(d - d.mean() if channel.balance == TORSION and len(d) else d)
-    if sum(map(len, found)) < 200:
-        return None
-    return float(np.sqrt(0.5 * np.mean(np.concatenate(found) ** 2)))
-
-
-def _alike(one: Mapping[str, FloatArray], two: Mapping[str, FloatArray]) -> bool:
-    if len(one["velocity"]) != len(two["velocity"]):
-        return False
-    apart = {axis: float(np.mean((one[axis] - two[axis]) ** 2)) for axis in ("velocity", "load")}
-    most = {axis: float(np.mean(one[axis] ** 2)) * _SAME**2 for axis in apart}
-    return 0.0 < most["velocity"] >= apart["velocity"] and 0.0 < 25.0 * most["load"] >= apart["load"]
+    return float(np.hypot(_rms(left.dataset.unexplained[channel]), np.sqrt(square)))
 
 
 def traces(left: Remaining) -> tuple[Trace, ...]:

@@ -71,7 +71,7 @@ def made_up() -> Diagnosed:
     names = ("load_dependent_friction", "torque_constant")
     values = {"load_coefficient": Value(0.07, (0.05, 0.09), "")}
     cause = Cause(names[0], 2, values, 40.0, 1.5, "motor", rivals=names[1:])
-    gap = Gap(2, "motor", 1.6, 0.4, "repeated runs", ())
+    gap = Gap(2, "motor", 1.6, 0.4, ())
     gain = Gain(1.6, 1.1, "each of 2 runs held out once", (0.3, 0.7))
     findings = Findings(CAUSE, (), ("a", "b"), (2,), (gap,), (cause,), gain=gain, traces=traces)
     return Diagnosed(2, load_joint(shipped("kinova_gen3/joint2.yaml")), findings)

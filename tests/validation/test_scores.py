@@ -105,7 +105,7 @@ def unknown(axis: str, low: float, high: float, **more: Any) -> dict[str, Any]:
 def mapped(  # noqa: PLR0917
     axis: str, text: str, low: float, high: float, unit: str, verdict: str = "unexplained"
 ) -> Findings:
-    gap = Gap(1, "motor", 1.0, 0.1, "", (Place(axis, text, 0.8, low, high, unit),))
+    gap = Gap(1, "motor", 1.0, 0.1, (Place(axis, text, 0.8, low, high, unit),))
     return findings(verdict, gaps=(gap,))
 
 

@@ -75,7 +75,7 @@ def findings(verdict: str = "cause", causes: tuple[Cause, ...] = (), **parts: An
         "reasons": ("made up",),
         "runs": ("a.csv", "b.csv.gz"),
         "joints": (1, 2),
-        "gaps": (Gap(2, "motor", 0.8, 0.2, "repeated runs", (place,)),),
+        "gaps": (Gap(2, "motor", 0.8, 0.2, (place,)),),
         "causes": causes,
         "predicts": tuple(
             Present(c.name, c.joint, {name: v.value for name, v in c.parameters.items()}) for c in causes

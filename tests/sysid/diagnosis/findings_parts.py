@@ -110,7 +110,7 @@ def gap(joint: int, balance: str, rmse: float, floor: float, hot: Mapping[str, M
         for axis in hot
         for each in sorted((p for p in everywhere if p.axis == axis), key=lambda p: -p.share)[:3]
     ]
-    return Gap(joint, balance, rmse, floor, "repeated runs", tuple(found))
+    return Gap(joint, balance, rmse, floor, tuple(found))
 
 
 Gone = Callable[[Any, Any, Any], Any]

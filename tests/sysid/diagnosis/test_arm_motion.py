@@ -8,7 +8,13 @@ import pytest
 from jtqd.estimator.joint import MotionLimits
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.next_experiment import NoRangeError, each_joint, joint_range_of, next_experiment
+from jtqd.sysid.diagnosis.next_experiment import (
+    MOTION_FILE,
+    NoRangeError,
+    each_joint,
+    joint_range_of,
+    next_experiment,
+)
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 from jtqd.sysid.planner.experiments import EXPERIMENTS, RATE_HZ, JointRange, csv_text, joint_motions
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, bench_run
@@ -92,18 +98,19 @@ def test_without_room_there_is_no_motion(limits: MotionLimits) -> None:
     with pytest.raises(NoRangeError, match="the joint stood in these runs"):
         joint_range_of(replace(JOINT, motion_limits=limits), [swung()])
     made = next_experiment([("hysteresis",)], {3: replace(JOINT, motion_limits=limits)}, signals=[swung()])
-    assert made["motion"] is made["plan"] is None
+    assert made["plan"] is None
+    assert "motions" not in made
     assert "No motion is planned" in made["why"]
 
 
 def test_without_runs_the_limits_of_the_file_are_the_room() -> None:
     limits = MotionLimits((-0.2, 0.4), velocity_rad_s=0.3, acceleration_rad_s2=1.0, torque_nm=10.0)
     made = next_experiment([], {1: replace(JOINT, motion_limits=limits)})
-    assert made["motion"]["travel_rad"] == [-0.2, 0.4]
+    assert made["motions"][MOTION_FILE]["travel_rad"] == [-0.2, 0.4]
     assert "no run shows what torque that needs" in made["why"]
-    assert next_experiment([], {1: JOINT})["motion"] is None
+    assert "motions" not in next_experiment([], {1: JOINT})
     without = next_experiment([], {1: replace(JOINT, motion_limits=MotionLimits((-0.2, 0.4), torque_nm=1.0))})
-    assert without["motion"] is None
+    assert "motions" not in without
     assert without["why"].endswith("(or --limits) lacks velocity_rad_s, acceleration_rad_s2.")
 
 
@@ -117,21 +124,23 @@ def test_one_run_is_too_few_and_shows_where_the_joint_may_go_all_the_same() -> N
     assert found.verdict == "insufficient_data"
     assert "found 1 usable run, expected at least 2" in found.reasons[-1]
     assert found.next_experiment is not None
-    low, high = found.next_experiment["motion"]["travel_rad"]
+    motion = found.next_experiment["motions"][MOTION_FILE]
+    low, high = motion["travel_rad"]
     assert float(position.min()) < low < high < float(position.max())
-    assert found.next_experiment["motion"]["velocity_rad_s"] < 5.0
+    assert motion["velocity_rad_s"] < 5.0
 
 
 def test_one_joint_gets_a_motion_and_no_towing_plan() -> None:
     made = next_experiment([("torque_constant", "sensor_gain")], {3: JOINT}, "Why.", signals=[swung()])
     assert made["plan"] is None
-    assert made["motion"]["joint"] == 3
-    assert "with a payload" in {run["what"] for run in made["motion"]["runs"]}
-    rows = made["table"].splitlines()
+    motion = made["motions"][MOTION_FILE]
+    assert motion["joint"] == 3
+    assert "with a payload" in {run["what"] for run in motion["runs"]}
+    rows = made["tables"][MOTION_FILE].splitlines()
     assert rows[0] == "run,time_s,position_rad,velocity_rad_s"
     positions = [float(row.split(",")[2]) for row in rows[1:]]
-    assert min(positions) >= made["motion"]["travel_rad"][0] - 1e-6
-    assert max(positions) <= made["motion"]["travel_rad"][1] + 1e-6
+    assert min(positions) >= motion["travel_rad"][0] - 1e-6
+    assert max(positions) <= motion["travel_rad"][1] + 1e-6
     assert made["why"].startswith(
         "Why. Proposed to distinguish torque_constant from sensor_gain: load_at_both"
     )
@@ -143,11 +152,11 @@ def test_every_joint_of_an_arm_gets_a_motion_of_its_own() -> None:
     limits = MotionLimits((-0.2, 0.4), velocity_rad_s=0.3, acceleration_rad_s2=1.0, torque_nm=10.0)
     free = replace(JOINT, motion_limits=limits)
     made = next_experiment([("hysteresis",)], {2: free, 3: JOINT, 4: free}, "Why.")
-    assert made["plan"] is made["motion"] is None
-    assert [each["joint"] for each in made["joints"]] == [2, 3, 4]
-    assert [each["motion"] and each["motion"]["joint"] for each in made["joints"]] == [2, None, 4]
-    assert set(made["tables"]) == {2, 4}
-    assert made["tables"][4] == next_experiment([("hysteresis",)], {4: free}, "Why.")["table"]
+    assert made["plan"] is None
+    assert [each["joint"] for each in made["motions"].values()] == [2, 4]
+    assert set(made["tables"]) == {f"next_experiment.joint{n}.motion.csv" for n in (2, 4)}
+    alone = next_experiment([("hysteresis",)], {4: free}, "Why.")["tables"][MOTION_FILE]
+    assert made["tables"]["next_experiment.joint4.motion.csv"] == alone
     assert all(f"Joint {n}: Why." in made["why"] for n in (2, 3, 4))
     assert "towing" not in made["why"]
     assert each_joint({2: {"why": "one"}}) == {"why": "one"}

@@ -250,14 +250,16 @@ def test_the_next_experiment_is_a_plan_that_the_campaign_reads(tmp_path: Path, c
 
 def test_the_motion_of_an_arm_is_a_file_beside(tmp_path: Path, core: Core) -> None:
     motion = {"joint": 1, "runs": [{"name": "a", "what": "empty", "duration_s": 3.0}]}
-    made = {"why": "w", "plan": None, "motion": motion, "table": "run,time_s\na,0\n"}
+    files = {"motions": {"next_experiment.motion.csv": motion}}
+    tables = {"next_experiment.motion.csv": "run,time_s\na,0\n"}
+    made = {"why": "w", "plan": None, **files, "tables": tables}
     core.answer = findings("ambiguous", next_experiment=made)
     write_runs(tmp_path)
     out = tmp_path / "o"
     run(tmp_path, "--joint", JOINT_FILE, "--out", out)
     assert (out / "next_experiment.motion.csv").read_text() == "run,time_s\na,0\n"
     found = made_in(out)
-    assert found["next_experiment"] == {"why": "w", "plan": None, "motion": motion}
+    assert found["next_experiment"] == {"why": "w", "plan": None, **files}
     assert "next_experiment.motion.csv" in found["files"]
     core.answer = findings("no_gap")
     run(tmp_path, "--joint", JOINT_FILE, "--out", out, "--force")
@@ -289,7 +291,7 @@ def test_options_reach_the_diagnosis(tmp_path: Path, core: Core, capsys: pytest.
 
 def test_limits_beyond_those_of_the_file_are_said(tmp_path: Path, core: Core) -> None:
     write_runs(tmp_path, numbers=(1,))
-    core.answer = findings("insufficient_data", next_experiment={"why": "w.", "plan": None, "motion": None})
+    core.answer = findings("insufficient_data", next_experiment={"why": "w.", "plan": None})
     limits = {"travel_rad": [-0.5, 0.5], "velocity_rad_s": 1.0}
     (tmp_path / "j.yaml").write_text(joint_text(motion_limits=limits))
     for asked, sentence in (
@@ -308,7 +310,7 @@ def test_limits_beyond_those_of_the_file_are_said(tmp_path: Path, core: Core) ->
 
 def test_a_towing_plan_says_that_it_does_not_keep_the_travel(tmp_path: Path, core: Core) -> None:
     write_runs(tmp_path)
-    core.answer = findings("insufficient_data", next_experiment={"why": "w.", "plan": PLAN, "motion": None})
+    core.answer = findings("insufficient_data", next_experiment={"why": "w.", "plan": PLAN})
     for asked, told in (("velocity_rad_s=0.5", False), ("travel_rad=-1:1", True)):
         run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "o", "--force", "--limits", asked)
         why = made_in(tmp_path / "o")["next_experiment"]["why"]

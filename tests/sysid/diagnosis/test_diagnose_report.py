@@ -179,7 +179,7 @@ def test_the_page_has_the_reason_and_the_command_of_the_next_experiment(pages: d
 def test_the_page_has_the_motions_of_a_joint() -> None:
     run = {"name": "full_turns_1", "what": "with a payload", "duration_s": 16.2}
     motion = {"joint": 3, "runs": [run, run]}
-    experiment = {"why": "By hand.", "plan": None, "motion": motion, "table": "time_s"}
+    experiment = {"why": "By hand.", "plan": None, "motions": {"next_experiment.motion.csv": motion}}
     text = text_of(render(replace(examples.insufficient(), next_experiment=experiment)))
     assert "next_experiment.motion.csv beside this page" in text
     assert "2 runs of joint 3full_turns_1, with a payload: 16.2 s" in text

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.regressors import RunData
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.structure import Balance, View, explained_by_bins, pursue
-from jtqd.sysid.diagnosis.unexplained import _repeats
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, run_data
 
 STEP_S = 0.005
@@ -157,26 +153,3 @@ def test_other_runs_predict_this_one() -> None:
             mine = parts[r][places[r] == b]
             assert energy[r, b] == pytest.approx(np.nansum(mine**2 - (mine - mean) ** 2))
             assert np.all(means[r][places[r] == b] == pytest.approx(mean))
-
-
-def test_the_floor_of_repeated_runs_is_their_noise() -> None:
-    t = 0.005 * np.arange(4000)
-    axes = {"velocity": np.cos(t), "load": 20.0 * np.sin(1.7 * t)}
-    same = 2.0 * np.sin(3.0 * t)
-    rng = np.random.default_rng(1)
-
-    def run(name: str, drift: float, conditions: dict[str, FloatArray]) -> RunData:
-        parts = {c: same + drift + rng.normal(0.0, 0.25, 4000) for c in (MOTOR1, TORSION1)}
-        return run_data(name, parts, conditions)
-
-    def dataset(*runs: RunData) -> Dataset:
-        return cast("Dataset", SimpleNamespace(runs=runs))
-
-    other = {"velocity": np.cos(1.3 * t), "load": 20.0 * np.sin(1.7 * t)}
-    repeated = dataset(run("a", 0.0, axes), run("b", 0.0, axes), run("c", 5.0, other))
-    for channel in (MOTOR1, TORSION1):
-        assert _repeats(repeated, channel) == pytest.approx(0.25, rel=0.05)
-    moved = dataset(run("a", 0.0, axes), run("b", 0.4, axes))
-    assert _repeats(moved, TORSION1) == pytest.approx(0.25, rel=0.05), "each run has its zero there"
-    assert _repeats(moved, MOTOR1) == pytest.approx((0.25**2 + 0.5 * 0.4**2) ** 0.5, rel=0.05)
-    assert _repeats(dataset(run("a", 0.0, axes), run("c", 0.0, other)), MOTOR1) is None
