@@ -99,24 +99,24 @@ _STEP: Final = 1.25
 
 def steps_of(x: FloatArray) -> FloatArray:
     """Return the steps of the values near each sample [n], in units of x; 0 where they are finer than shows: of decimals
-    (fixed, or significant digits), single precision, or counts.
+    (fixed, or significant digits), single precision, or counts, which are the same everywhere.
     """
-    out = np.zeros(len(x))
+    out, counts = np.zeros(len(x)), np.zeros(len(x))
     for there in _magnitudes(x):
         values = np.unique(x[there])
         if len(values) <= 8:  # at rest or commanded: they show no step
             continue
         largest = max(float(np.max(np.abs(values))), 1e-12)
-        printed = max(_decimal(values, largest), _single(values))
-        counts = _counts(values, largest, printed, again=len(values) < 0.8 * there.sum())
-        out[there] = max(printed, counts)
+        out[there] = max(_decimal(values, largest), _single(values))
+        counts[there] = _counts(values, largest, out[there][0], again=len(values) < 0.8 * there.sum())
     decade = _decades(np.abs(x))
     for e in np.unique(decade):  # few beyond a power of ten have ten times the step
         there = decade == e
         values = np.unique(x[there])
         if len(values) > 2 and 2 * len(values) > there.sum():
             out[there] = np.maximum(out[there], _decimal(values, float(np.max(np.abs(values)))))
-    return out
+    usual = float(np.median(counts))
+    return np.maximum(out, np.maximum(counts, usual))
 
 
 def described(x: FloatArray, unit: str) -> str:
