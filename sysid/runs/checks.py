@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 from typing import Any, Final
 
 import numpy as np
@@ -42,12 +43,12 @@ from jtqd.sysid.runs.run_file import SHORTEST_SEGMENT_S, RunFile
 
 SLOWEST_HZ: Final = 50.0
 """Below it accelerations and reversals are not in the data, and ripple of slow motion is aliased."""
-UNEVEN: Final = 0.3
-"""A step this part off the median is uneven: jitter of a stamp is less, a lost row more."""
-JITTER: Final = 0.05
-"""Less is no jitter (`diagnosis.signals.second_difference` takes such steps for even)."""
-_SMOOTHER: Final = 0.7
-"""Equal steps are taken where they leave this part of the roughness that positions have over the stamps, or less."""
+_NOTED: Final = 0.05
+"""Part of a step by which stamps are off equal steps, to be noted."""
+_EVEN: Final = 1e-6
+"""The same: less is rounding."""
+_SMOOTHER: Final = 0.98
+"""Part of the roughness over equal steps that positions have over the stamps, at most, where the samples were taken then."""
 _ROWS_AHEAD: Final = 4
 _FOLLOWED: Final = 0.05
 """Part of a stamp's distance by which the phase of the cycles follows it: a clock drifts, jitter does not last."""
@@ -78,33 +79,30 @@ def check_rate(time_s: FloatArray, where: str) -> list[RunIssue]:
 
 
 def on_even_steps(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]]:
-    """Return the run resampled to equal steps where its own are uneven, and a note of it.
+    """Return the run on equal steps, and a note where its stamps are off them.
 
-    Values between two rows lie on a cubic: linear interpolation would put two steps into the acceleration at every lost
-    cycle. Stamps of a computer's clock, or rounded ones, jitter where the samples do not: stamps or equal steps with rows
-    missing are taken, whichever leaves positions smoother.
+    Samples may be taken at the times that their stamps say, or at equal times that the stamps of a computer's clock, or of
+    few digits, jitter about. Both are tried: positions are smooth over the right ones. Values between two rows lie on a
+    cubic: linear interpolation would put two steps into the acceleration at every lost cycle.
     """
     steps = np.diff(table.time_s)
     median = float(np.median(steps))
-    off = np.abs(steps - median)
-    if np.max(off) <= JITTER * median:
+    apart = np.abs(steps - median)
+    if np.max(apart) <= _EVEN * median:
         return table, []
-
-    def found(part: float) -> str:
-        count = int(np.count_nonzero(off > part * median))
-        return (
-            f"{where}: time_s: found {count} of {len(steps)} steps off the median of {median:.4g} s by more than "
-            f"{part:.0%} (up to {float(np.max(steps)):.4g} s)"
-        )
-
-    by_stamps = _resampled(table, table.time_s, median)
-    equal = _resampled(table, *_equal_steps(table.time_s, median))
-    if _roughness(equal) < _SMOOTHER * _roughness(by_stamps):
-        text = f"{found(JITTER)}, but positions that are smooth over equal steps: the stamps jitter, not the samples"
-        return equal, [RunIssue("time_jitter", f"{text}; equal steps used")]
-    if np.max(off) <= UNEVEN * median:
-        return table, []
-    return by_stamps, [RunIssue("time_uneven", f"{found(UNEVEN)}: resampled to equal steps")]
+    equal, step = _equal_steps(table.time_s, median)
+    jitters = _roughness(table, table.time_s) >= _SMOOTHER * _roughness(table, equal)
+    out = _resampled(table, equal if jitters else table.time_s, step)
+    if np.max(apart) <= _NOTED * median:
+        return table if jitters else out, []
+    found = (
+        f"{where}: time_s: found {int(np.count_nonzero(apart > _NOTED * median))} of {len(steps)} steps off the median of "
+        f"{median:.4g} s by more than {_NOTED:.0%} (up to {float(np.max(steps)):.4g} s)"
+    )
+    if not jitters or np.max(np.abs(table.time_s - equal)) <= _NOTED * median:
+        return out, [RunIssue("time_uneven", f"{found}: resampled to equal steps")]
+    text = f"{found}, but positions are smooth over equal steps: the stamps jitter, not the samples; equal steps used"
+    return out, [RunIssue("time_jitter", text)]
 
 
 def _resampled(table: RunTable, time_s: FloatArray, step_s: float) -> RunTable:
@@ -138,10 +136,20 @@ def _equal_steps(time_s: FloatArray, step_s: float) -> tuple[FloatArray, float]:
     return time_s[0] + step * cycles, step
 
 
-def _roughness(table: RunTable) -> float:
-    """Return the geometric mean of the fourth differences of the positions that move; NaN without one."""
-    positions = [getattr(columns, name) for columns in table.joints.values() for name in _POSITIONS]
-    rough = [float(np.std(np.diff(x, 4))) for x in positions if x is not None and np.ptp(x) > 0.0]
+def _roughness(table: RunTable, time_s: FloatArray) -> float:
+    """Return the geometric mean, over the positions that move, of the rms by which a value is off the cubic through its four
+    neighbours, with the rows at these times [n]; NaN without one.
+    """
+    near = np.column_stack([time_s[k : len(time_s) - 4 + k] for k in (0, 1, 3, 4)]) - time_s[2:-2, None]
+    weights = np.ones_like(near)
+    for k, m in permutations(range(4), 2):  # Lagrange's, at 0
+        weights[:, k] *= near[:, m] / (near[:, m] - near[:, k])
+    rough = []
+    for columns in table.joints.values():
+        for x in (getattr(columns, name) for name in _POSITIONS):
+            if x is not None and np.ptp(x) > 0.0:
+                beside = np.column_stack([x[k : len(x) - 4 + k] for k in (0, 1, 3, 4)])
+                rough.append(float(np.std(x[2:-2] - np.sum(weights * beside, axis=1))))
     return math.exp(float(np.mean(np.log(rough)))) if rough and min(rough) > 0.0 else math.nan
 
 
