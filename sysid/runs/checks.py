@@ -47,6 +47,7 @@ _NOTED: Final = 0.05
 """Part of a step by which stamps are off equal steps, to be noted."""
 _EVEN: Final = 1e-6
 """The same: less is rounding."""
+_NEIGHBOURS: Final = 0, 1, 3, 4
 _SMOOTHER: Final = 0.98
 """Part of the roughness over equal steps that positions have over the stamps, at most, where the samples were taken then."""
 _ROWS_AHEAD: Final = 4
@@ -95,10 +96,9 @@ def on_even_steps(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]
     out = _resampled(table, equal if jitters else table.time_s, step)
     if np.max(apart) <= _NOTED * median:
         return table if jitters else out, []
-    found = (
-        f"{where}: time_s: found {int(np.count_nonzero(apart > _NOTED * median))} of {len(steps)} steps off the median of "
-        f"{median:.4g} s by more than {_NOTED:.0%} (up to {float(np.max(steps)):.4g} s)"
-    )
+    count, longest = int(np.count_nonzero(apart > _NOTED * median)), float(np.max(steps))
+    off = f"off the median of {median:.4g} s by more than {_NOTED:.0%} (up to {longest:.4g} s)"
+    found = f"{where}: time_s: found {count} of {len(steps)} steps {off}"
     if not jitters or np.max(np.abs(table.time_s - equal)) <= _NOTED * median:
         return out, [RunIssue("time_uneven", f"{found}: resampled to equal steps")]
     text = f"{found}, but positions are smooth over equal steps: the stamps jitter, not the samples; equal steps used"
@@ -140,16 +140,17 @@ def _roughness(table: RunTable, time_s: FloatArray) -> float:
     """Return the geometric mean, over the positions that move, of the rms by which a value is off the cubic through its four
     neighbours, with the rows at these times [n]; NaN without one.
     """
-    near = np.column_stack([time_s[k : len(time_s) - 4 + k] for k in (0, 1, 3, 4)]) - time_s[2:-2, None]
+    n = len(time_s) - 4
+    near = np.column_stack([time_s[k : n + k] for k in _NEIGHBOURS]) - time_s[2:-2, None]
     weights = np.ones_like(near)
     for k, m in permutations(range(4), 2):  # Lagrange's, at 0
         weights[:, k] *= near[:, m] / (near[:, m] - near[:, k])
-    rough = []
-    for columns in table.joints.values():
-        for x in (getattr(columns, name) for name in _POSITIONS):
-            if x is not None and np.ptp(x) > 0.0:
-                beside = np.column_stack([x[k : len(x) - 4 + k] for k in (0, 1, 3, 4)])
-                rough.append(float(np.std(x[2:-2] - np.sum(weights * beside, axis=1))))
+    every = [getattr(columns, name) for columns in table.joints.values() for name in _POSITIONS]
+    moving = [x for x in every if x is not None and np.ptp(x) > 0.0]
+    beside = [np.column_stack([x[k : n + k] for k in _NEIGHBOURS]) for x in moving]
+    rough = [
+        float(np.std(x[2:-2] - np.sum(weights * b, axis=1))) for x, b in zip(moving, beside, strict=True)
+    ]
     return math.exp(float(np.mean(np.log(rough)))) if rough and min(rough) > 0.0 else math.nan
 
 
