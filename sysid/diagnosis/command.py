@@ -66,10 +66,7 @@ REPORT: Final = "report.html"
 EXTENDED: Final = "extended.joint.yaml"
 _DIGITS: Final = 7
 """Significant digits of a written value; no interval is a millionth of it."""
-_OWN: Final = (
-    *(FINDINGS, REPORT, EXTENDED, "extended.joint[1-7].yaml", "next_experiment.plan.yaml"),
-    *("next_experiment.motion.csv", "next_experiment.joint[1-7].motion.csv"),
-)
+_OWN: Final = (FINDINGS, REPORT, "extended.joint*.yaml", "next_experiment.*")
 """All names that a diagnosis may write."""
 _ITEM: Final = re.compile(r"(?:(?P<where>[1-7]|sensor)=)?(?P<name>[a-z_]+)")
 _SIZE: Final = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?) *(%|[a-zµ]+)", re.IGNORECASE)

@@ -28,6 +28,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.findings import EVERYTHING, JointName, Scope
+from jtqd.sysid.diagnosis.limits import RELEVANCE
 from jtqd.sysid.diagnosis.regressors import (
     ChannelData,
     EffectCandidate,
@@ -54,18 +55,22 @@ from jtqd.sysid.diagnosis.signals import (
     with_one_sensor,
     without_held,
 )
-from jtqd.sysid.diagnosis.structure import STRONG_LINE, View, frequency_lines, order_lines, sharpened
+from jtqd.sysid.diagnosis.structure import HZ_STEP, STRONG_LINE, View, frequency_lines, order_lines, sharpened
 from jtqd.sysid.runs.bad_samples import held_values, saturation_limits
 from jtqd.sysid.runs.channels import Channels
 
 FEWEST_RUNS: Final = 2
+"""Recordings: one is held out."""
 SHORTEST_MOVING_S: Final = 5.0
+"""Time in motion of all runs."""
 SLOWEST_HZ: Final = 50.0
+"""Sampling rate: friction near reversals and ripple are lost below."""
 ORDER_STEP_S: Final = 0.002
+"""Bins in which whole orders are looked for: the motor turns a fraction of a wave."""
 _SIDELOBES: Final = 0.25
-_LOWEST_ORDER: Final = 0.7
+"""Distance of orders within which a peak belongs to a stronger line."""
 _MOST_LINES: Final = 4
-_SAME_HZ: Final = 0.3
+"""Lines of a channel that become regressors."""
 _DRAWS: Final = 6
 """Fixed-point steps to the current that a file with effects draws."""
 _NAMED: Final = re.compile(r"(?P<of>.+) \((?P<piece>\d+) of (?P<all>\d+)\)")
@@ -74,11 +79,9 @@ _LOST_S: Final = 1.0
 
 SETTLED_S: Final = 0.1
 """After the stage went off: the current dies away, and what it twisted springs back. Left out at the other end too."""
-SHORTEST_S: Final = 0.3
-"""Of what is left of a rest without power: less is no reading."""
-DRIFT: Final = 5e-4
-"""Of the rated torque over G Kt: what the zero of a current sensor may change by between the reading and the motion, a
-tenth of the usual relevance. All readings of a joint together are no more certain than this.
+DRIFT: Final = 0.1 * RELEVANCE
+"""Of the rated torque over G Kt: what the zero of a current sensor may change by between the reading and the motion. All
+readings of a joint together are no more certain than this.
 """
 
 
@@ -441,11 +444,11 @@ def unknown_lines(
         there = [o.order for o in out if o.channel == line.channel]
         there += [order for joint, order in known if joint == line.channel.joint]
         near = any(abs(order - line.order) < _SIDELOBES for order in there)
-        if line.ratio > STRONG_LINE and line.order > _LOWEST_ORDER and not near:
+        if line.ratio > STRONG_LINE and not near:
             out.append(sharpened(line, bare, residuals[line.channel], step_s))
     hz = [line for line in frequency_lines(bare, residuals, step_s) if line.ratio > STRONG_LINE]
     # one vibration of the frame or the sensor, in every channel that shows it
-    return [*out[:_MOST_LINES], *(line for line in hz if abs(line.order - hz[0].order) < _SAME_HZ)]
+    return [*out[:_MOST_LINES], *(line for line in hz if abs(line.order - hz[0].order) <= HZ_STEP)]
 
 
 # Readings without power.
@@ -461,12 +464,12 @@ def reading(s: JointSignals) -> Reading | None:
     """Return the reading of one joint in one run, None without a rest without power that is long enough."""
     if s.off is None or not s.off.any():
         return None
-    edge, least = round(SETTLED_S / s.step_s), round(SHORTEST_S / s.step_s)
+    edge = round(SETTLED_S / s.step_s)
     bounds = np.flatnonzero(np.diff(np.concatenate(([0], s.off.astype(np.int8), [0]))))
     rests = [
         s.current_a[first:last]
         for first, last in zip(bounds[::2] + edge, bounds[1::2] - edge, strict=True)
-        if last - first >= least
+        if last - first >= edge
     ]
     if not rests:
         return None

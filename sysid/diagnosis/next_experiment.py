@@ -21,7 +21,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint, MotionLimits
 from jtqd.estimator.text import counted
-from jtqd.sysid.diagnosis.signals import JointSignals
+from jtqd.sysid.diagnosis.signals import SLOWEST_RAD_S, JointSignals
 from jtqd.sysid.diagnosis.smoothing import below
 from jtqd.sysid.planner.campaigns import allowed_torque, missing_limits
 from jtqd.sysid.planner.experiments import (
@@ -35,6 +35,7 @@ from jtqd.sysid.planner.experiments import (
 from jtqd.sysid.planner.plan import Plan, check_plan, travel_rad
 
 MOST_KINDS: Final = 3
+"""Kinds of motion in one experiment."""
 _DEFAULT: Final = "excitation"
 SHOWN_BY: Final = {name: effect.experiment for name, effect in EFFECTS.items()}
 """Effect -> kind of experiment that shows it."""
@@ -59,10 +60,12 @@ _INSIDE: Final = 0.05
 _TORQUE_SHARE: Final = 0.9
 """Of the allowed torque: positions that needed more in the runs are not visited."""
 _BINS: Final = 24
+"""Of the travel, in each of which the largest torque is known."""
 _LEAST_TRAVEL_RAD: Final = 0.02
-_LEAST_SPEED_RAD_S: Final = 0.005
+"""A joint that moved less stood."""
 _ACCELERATION_QUANTILE: Final = 0.99
 _ACCELERATION_S: Final = 0.1
+"""The acceleration of a run: this quantile of means over this time."""
 _TOWING: Final = (
     "On a towing bench diagnose both joints together: the plan is then a campaign, and a sensor fault is in the "
     "balances of both joints, a joint fault in one."
@@ -113,7 +116,7 @@ def next_experiment(
     plan = replace(plan, limits=replace(plan.limits, travel_rad=float(np.ceil(travel))))
     parts = _begun(classes, why, {kind: EXPERIMENTS[kind].pair_text for kind in kinds})
     parts.append(
-        f"{counted(len(plan.runs), 'run')}, {plan.duration_s / 60.0:.0f} min, at most {plan.limits.torque_nm:g} Nm and "
+        f"{counted(len(plan.runs), 'run')}, {plan.duration_s:.0f} s, at most {plan.limits.torque_nm:g} Nm and "
         f"{plan.limits.current_a:g} A."
     )
     return {"why": " ".join(parts), "plan": plan.to_mapping()}
@@ -148,7 +151,7 @@ def _of_one_joint(
     except NoRangeError as reason:
         return {"why": " ".join([*parts, f"No motion is planned: {reason}."]), "plan": None}
     made = joint_motions(kinds, room)
-    minutes = sum(motion.duration_s for motion in made) / 60.0
+    length_s = sum(motion.duration_s for motion in made)
     needed = (
         f"as in these runs and within the joint's limits; there they needed up to {room.needed_nm:.3g} Nm of "
         f"{room.torque_nm:.3g} Nm, a payload may add no more than the rest."
@@ -159,7 +162,7 @@ def _of_one_joint(
             f"{room.torque_nm:.3g} Nm."
         )
     parts += [
-        f"Joint {number} alone, {counted(len(made), 'run')}, {minutes:.0f} min, {room.low_rad:.3g} to {room.high_rad:.3g} "
+        f"Joint {number} alone, {counted(len(made), 'run')}, {length_s:.0f} s, {room.low_rad:.3g} to {room.high_rad:.3g} "
         f"rad, at most {room.velocity_rad_s:.3g} rad/s and {room.acceleration_rad_s2:.3g} rad/s2, {needed}",
         "All other joints stand as they did in these runs.",
     ]
@@ -211,7 +214,7 @@ def joint_range_of(joint: Joint, signals: Sequence[JointSignals]) -> JointRange:
     acceleration = min(acceleration, max(_acceleration(s) for s in signals))
     low = max(limits.travel_rad[0], float(np.min(position)))
     high = min(limits.travel_rad[1], float(np.max(position)))
-    moved = high - low >= _LEAST_TRAVEL_RAD and speed >= _LEAST_SPEED_RAD_S and acceleration > 0.0
+    moved = high - low >= _LEAST_TRAVEL_RAD and speed >= SLOWEST_RAD_S and acceleration > 0.0
     stretch = _calm_stretch(position, torque, low, high, _TORQUE_SHARE * allowed) if moved else None
     if stretch is None:
         raise NoRangeError(

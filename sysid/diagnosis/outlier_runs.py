@@ -1,12 +1,12 @@
 """Outlier runs: runs whose channels differ from those of all others in gain, offset or delay.
 
-An effect of the joint is in all runs, and changes from day to day are small. A larger deviation of one run alone is the
+An effect of the joint is in all runs, and run-to-run variation is small. A larger deviation of one run alone is the
 run's own: a loose plug, a sensor zeroed again, another filter of the drive.
 
     y_r = X_r beta + Z_r u_r + w_r d_r + e          w: a unit of gain, zero or delay of one channel of run r alone
 
 1. Effects of the library and deviations of single runs are added one by one, whichever lowers the squared error most, beside
-   the usual changes u_r from run to run (`regressors.families`), until none lowers BIC by ENTER.
+   run-to-run variation u_r (`regressors.families`), until none lowers BIC by ENTER.
 2. A run is an outlier where a deviation was chosen and, with the chosen effects fitted too, differs from the mean of the
    other runs by more than FAR standard deviations. These hold the run's own error and the spread of the others, mixed with
    the usual one (USUAL, worth `limits.RUNS_COUNT` runs). Of a gain only what is beyond its `echo` counts: a channel that is
@@ -76,7 +76,7 @@ def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
     far = []
     for at in off:
         found = comparison.far(chosen, at, kinds)
-        if found is not None and comparison.explains_what_is_apart(chosen, off, at):
+        if found is not None and comparison.explains_excess(chosen, off, at):
             far.append((comparison.drop(chosen, off, *at), at, found))
     if not far:
         return None
@@ -111,7 +111,7 @@ def compared(dataset: Dataset, kinds: Sequence[Deviation]) -> Comparison:
         echoes, pieces, [[echo(kind, signals, run.samples) for kind in kinds] for run, signals in both]
     )
     sigma = np.array([family.sigma for family in dataset.families])
-    return Comparison(without_days(grams, columns, sigma), rows, columns, echoes)
+    return Comparison(without_variation(grams, columns, sigma), rows, columns, echoes)
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class Comparison:
     def chosen(self, candidates: Sequence[EffectCandidate]) -> tuple[list[int], list[tuple[int, int]]]:
         """Return the columns of the effects, and the deviations (run, kind), that are there: added one by one."""
         own = [(r, k) for r in range(len(self.runs)) for k in range(self.kinds)]
-        log_n = math.log(max(float(self.rows.sum()), 10.0))
+        log_n = math.log(float(self.rows.sum()))
         price = log_n + 2.0 * math.log(len(own))
         blocks: list[tuple[list[int], EffectCandidate | tuple[int, int], float]] = [
             (list(c.columns), c, c.size * log_n) for c in candidates if not c.effect.scales_all
@@ -177,7 +177,7 @@ class Comparison:
         beside = [*chosen, *(self.place(*at) for at in off if at[0] != r)]
         return explained(self.total, [*beside, self.place(r, k)]) - explained(self.total, beside)
 
-    def explains_what_is_apart(
+    def explains_excess(
         self, chosen: Sequence[int], off: Sequence[tuple[int, int]], at: tuple[int, int]
     ) -> bool:
         """Return whether a deviation is most of what sets its run apart beside all else that was chosen."""
@@ -253,14 +253,14 @@ def _with_columns(
     return replace(run, channels=channels)
 
 
-def without_days(grams: FloatArray, columns: int, sigma: FloatArray) -> FloatArray:
+def without_variation(grams: FloatArray, columns: int, sigma: FloatArray) -> FloatArray:
     """Return per run the normal equations of effects, deviations and residual [r, P + K + 1, same], with the usual changes
     from run to run (of standard deviation sigma [q]) integrated out.
     """
-    days = np.arange(columns, columns + len(sigma))
+    own = np.arange(columns, columns + len(sigma))
     rest = np.concatenate((np.arange(columns), np.arange(columns + len(sigma), grams.shape[1])))
-    inner = np.linalg.inv(grams[:, days[:, None], days] + np.diag(1.0 / sigma**2))
-    cross = grams[:, rest[:, None], days]
+    inner = np.linalg.inv(grams[:, own[:, None], own] + np.diag(1.0 / sigma**2))
+    cross = grams[:, rest[:, None], own]
     return np.asarray(grams[:, rest[:, None], rest] - cross @ inner @ cross.transpose(0, 2, 1))
 
 

@@ -399,8 +399,11 @@ def where(place_: Place) -> str:
 TEMPLATE: Final = "report.html.j2"
 WIDE_IN: Final = 9.2
 _HIGH_IN: Final = 2.6
+"""Size of a figure and of a panel [inch]."""
 _BUCKETS: Final = 360
+"""Parts of a curve, each drawn by its extremes."""
 _FLOOR_SIGMAS: Final = 2.0
+"""Half width of the band of noise, in standard deviations."""
 _TITLE: Final[dict[str, Any]] = {"loc": "right", "fontsize": 8.0, "color": LIGHT["soft"], "pad": 3.0}
 _TORQUE: Final = {"motor": "motor torque G Kt i", "torsion": "torque by the twist"}
 
@@ -425,6 +428,7 @@ def render(findings: Findings) -> str:
         "number": number,
         "effect_title": effect_title,
         "in_words": in_words,
+        "capital": _capital,
     }
     return page.render("jtqd.sysid.diagnosis", TEMPLATE, content, filters)
 

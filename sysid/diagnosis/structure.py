@@ -9,16 +9,17 @@ takes out the view of most energy and searches again (matching pursuit: Mallat a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
-from scipy import linalg, signal
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR
+from jtqd.sysid.diagnosis.limits import LISTED, RELEVANCE
 from jtqd.sysid.diagnosis.regressors import Index, RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
 
@@ -36,48 +37,40 @@ AXES: Final = {
 BINS: Final = 12
 """Of an axis; twice as many of velocity, current and link angle."""
 BLOCK_S: Final = 1.0
-"""Seconds that are independent of each other; a bin's mean counts as if it had been zero for so long before."""
-FLIPS: Final = 9999
+"""Seconds that are independent of each other; a bin's mean counts as if it had been zero for so long before. What is less
+apart is one event, or one stay in a bin of angle.
+"""
 SIGNIFICANT: Final = 1e-3
 """Of some twenty conditions of a balance that are looked at, one in fifty balances has one this unlikely by chance."""
-LEAST: Final = 6e-4
-"""Part of the rated torque (rms) from which a view is worth a place."""
+FLIPS: Final = round(10.0 / SIGNIFICANT) - 1
 MOST: Final = 3
 """Views that are taken out."""
-ORDERS: Final = np.arange(0.3, 10.0, 0.04)
-"""Per motor revolution, where lines of a residual are looked for."""
+ORDERS: Final = np.arange(0.7, 10.0, 0.04)
+"""Per motor revolution, where lines of a residual are looked for; what is slower is a condition of the angle."""
 _HZ: Final = (2.0, 40.0)
-AR_ORDER: Final = 24
-"""Of the autoregression."""
+"""Where vibrations of frames and sensors are looked for."""
+HZ_STEP: Final = 0.25 / BLOCK_S
+"""Of the spectrum: stretches are four blocks long."""
 STRONG_LINE: Final = 25.0
 """Power of a line against the median of its neighbourhood."""
 _PEAK: Final = 8.0
 """The same of a peak that may be one: noise has one in some thousand bins (exp(-8))."""
 _FEWEST_TURNS: Final = 8.0
+"""Of the motor in a stretch: an eighth of an order is resolved."""
 _FAR: Final = 60.0
-"""Energy of a moment against the median: whitened Gaussian noise over ten samples never reaches a twentieth of it, the mean
-of a normal second does once in 10^7 seconds.
-"""
+"""Square of a change, or of the mean of a second, against the median: Gaussian noise reaches it once in 10^7."""
 _EVENT_S: Final = 0.05
-_JUMP: Final = 0.01
-"""Part of the rated torque by which the residual must move for an event."""
-_JOIN_S: Final = 0.5
-"""Onset and end of one event, or two stays in one bin of angle, are at most this far apart."""
-_AGREE: Final = 0.5
-"""Part of the energy of the events in a bin of angle that the other passes must predict."""
-_WANDER: Final = 0.006
-"""Part of the rated torque (rms of means over seconds) from which a residual is not noise, in all seconds; a third of it in
-those that stand out.
-"""
+"""Time of a change."""
+Times = tuple[tuple[str, float], ...]
+"""Moments: run, time [s]."""
 
 
 @dataclass(frozen=True)
 class Balance:
-    """A balance of a joint in all runs: ar: autoregression of its noise; step_s: of a sample; rated_nm: of the joint."""
+    """A balance of a joint in all runs; step_s: of a sample; rated_nm: of the joint."""
 
     runs: Sequence[RunData]
     channel: Channel
-    ar: FloatArray
     step_s: float
     rated_nm: float
 
@@ -88,8 +81,8 @@ class Balance:
 
     @property
     def least_nm2(self) -> float:
-        """The least energy of a view."""
-        return float((LEAST * self.rated_nm) ** 2)
+        """The least energy of a view: what is smaller is not listed as an entry either."""
+        return float((LISTED * RELEVANCE * self.rated_nm) ** 2)
 
 
 @dataclass(frozen=True)
@@ -111,7 +104,7 @@ class View:
     places: Sequence[Index] = ()
     side: Sequence[FloatArray] = ()
     what: str = ""
-    times: tuple[tuple[str, float], ...] = ()
+    times: Times = ()
     masks: Sequence[BoolArray] = ()
     line: Line | None = None
 
@@ -167,8 +160,8 @@ def _views(balance: Balance, parts: Sequence[FloatArray], before: Sequence[View]
     out = [v for v in (best, turn) if v and new(v)]
     if out:
         rest = max(out, key=lambda v: v.energy_nm2).taken_from(parts)
-        moments = events(balance, rest)
-    if moments:
+    if moments:  # what the best condition leaves of them
+        moments = _moments_view(rest, moments.masks, moments.times)
         rest = moments.taken_from(rest)
     others = (moments, seconds(balance, rest), *lines(balance, parts))
     return out + [v for v in others if v and new(v)]
@@ -365,7 +358,7 @@ def frequency_lines(
             for first in range(0, len(x) - length + 1, length // 2):
                 piece = x[first : first + length]
                 good = np.isfinite(piece)
-                if good.mean() >= 0.6:
+                if 2.0 * good.mean() > 1.0:
                     shape = window * good
                     piece = np.where(good, piece - np.nanmean(piece), 0.0)
                     powers.append(np.abs(np.fft.rfft(piece * shape) / shape.sum()) ** 2)
@@ -433,65 +426,50 @@ def sharpened(line: Line, runs: Sequence[RunData], parts: Sequence[FloatArray], 
 # Events and seconds.
 
 
-def autoregression(stretches: Sequence[FloatArray], order: int = AR_ORDER) -> FloatArray:
-    """Return a [order]: x_t = sum a_k x_{t-k} + e, by Yule-Walker over series with NaN for gaps."""
-    lags = [np.concatenate([x[k:] * x[: len(x) - k] for x in stretches]) for k in range(order + 1)]
-    covariance = np.array([np.nansum(x) / max(np.isfinite(x).sum(), 1) for x in lags])
-    covariance[0] = covariance[0] * (1.0 + 1e-6) or 1.0
-    return np.asarray(linalg.solve_toeplitz(covariance[:-1], covariance[1:]))
-
-
-def whiten(x: FloatArray, a: FloatArray) -> FloatArray:
-    """Return x_t - sum a_k x_{t-k} along axis 0; the first rows, whose past is unknown, take it as zero."""
-    return np.asarray(signal.lfilter(np.append(1.0, -a), 1.0, x, axis=0))
-
-
-def past_valid(valid: BoolArray, order: int) -> BoolArray:
-    """Return where a row and its `order` predecessors are valid."""
-    out = np.convolve(~valid, np.ones(order + 1))[: len(valid)] < 0.5
-    out[:order] = False
-    return np.asarray(out, np.bool_)
-
-
 def events(balance: Balance, parts: Sequence[FloatArray]) -> View | None:
     """Return the events of a residual [run][n], NaN where not valid; None without any.
 
-    Stretches whose whitened energy is far above the usual, where the residual itself moves far enough. A jump, a dip, a
-    dropped reading: whitening makes a short peak of each. What lies between two stretches close together is one.
+    Between two changes of its mean over _EVENT_S that are far above the usual, and large enough to matter. A jump, a dip, a
+    dropped reading has one at either end; what lies between two changes close together is one event.
     """
     wide = max(4, round(_EVENT_S / balance.step_s))
-    energies = []
-    for x in parts:
-        known = past_valid(np.isfinite(x), len(balance.ar))
-        white = np.where(known, whiten(np.nan_to_num(x), balance.ar), np.nan)
-        energies.append(np.mean(white[: len(x) // wide * wide].reshape(-1, wide) ** 2, axis=1))
-    if np.isfinite(np.concatenate(energies)).sum() < 50:
-        return None
-    usual = float(np.nanmedian(np.concatenate(energies)))
+    means = [_means(x, wide) for x in parts]
+    changes = [np.abs(np.diff(m)) for m in means]
+    every = np.concatenate(changes)
+    usual = float(np.median(every[np.isfinite(every)] ** 2)) if np.isfinite(every).any() else 0.0
+    least = max(math.sqrt(_FAR * usual), RELEVANCE * balance.rated_nm)
     found, masks = list[tuple[float, str, float]](), []
-    for run, x, energy in zip(balance.runs, parts, energies, strict=True):
+    for run, x, change in zip(balance.runs, parts, changes, strict=True):
         mask, end = np.zeros(len(x), bool), -(10**9)  # of the event before
-        for k in np.flatnonzero(np.nan_to_num(energy) > _FAR * usual).tolist():
-            first, last = max(0, (k - 1) * wide), (k + 2) * wide
-            near = x[first:last][np.isfinite(x[first:last])]
-            if len(near) > 2 and float(np.ptp(near)) > _JUMP * balance.rated_nm:
-                found.append((float(energy[k] / usual), run.name, float(run.time_s[k * wide])))
-                mask[end if 0 < first - end <= _JOIN_S / balance.step_s else first : last] = True
-                end = last
+        for k in np.flatnonzero(np.nan_to_num(change) > least).tolist():
+            first, last = k * wide, (k + 2) * wide
+            if first - end <= BLOCK_S / balance.step_s:
+                first = min(first, end)
+            else:
+                found.append((float(change[k]), run.name, float(run.time_s[first + wide])))
+            mask[first:last], end = True, last
         masks.append(mask)
     if not found:
         return None
+    return _moments_view(parts, masks, _moments(found))
+
+
+def _moments_view(parts: Sequence[FloatArray], masks: Sequence[BoolArray], times: Times) -> View:
+    """Return the events of these samples [run][n] as a view of a residual."""
     own = [np.where(m & np.isfinite(x), x, 0.0) for m, x in zip(masks, parts, strict=True)]
-    return _view("time", parts, own, masks=masks, what="events", times=_moments(found))
+    return _view("time", parts, own, masks=masks, what="events", times=times)
 
 
-def _moments(found: list[tuple[float, str, float]]) -> tuple[tuple[str, float], ...]:
-    """Return (run, time) strongest first, one per event."""
-    kept: list[tuple[str, float]] = []
-    for _, run, t in sorted(found, reverse=True):
-        if all(run != r or abs(t - u) > 0.3 for r, u in kept):
-            kept.append((run, t))
-    return tuple(kept)
+def _means(x: FloatArray, block: int) -> FloatArray:
+    """Return means over whole blocks of a residual; NaN where less than half of a block is valid."""
+    cut = x[: len(x) // block * block].reshape(-1, block)
+    count = np.isfinite(cut).sum(axis=1)
+    return np.where(2 * count > block, np.nansum(cut, axis=1) / np.maximum(count, 1), np.nan)
+
+
+def _moments(found: list[tuple[float, str, float]]) -> Times:
+    """Return (run, time) strongest first."""
+    return tuple((run, t) for _, run, t in sorted(found, reverse=True))
 
 
 def at_angle(balance: Balance, parts: Sequence[FloatArray], moments: View) -> View | None:
@@ -514,8 +492,8 @@ def at_angle(balance: Balance, parts: Sequence[FloatArray], moments: View) -> Vi
         each, _ = explained_by_bins([k for k, _ in passes], [y for _, y in passes], bins, zero)
         best = np.maximum(best, each.sum(axis=0))
     energy = np.bincount(np.concatenate(places), np.nan_to_num(np.concatenate(own)) ** 2, bins)
-    agree = best > _AGREE * energy
-    if energy[agree].sum() <= _AGREE * energy.sum():
+    agree = 2.0 * best > energy
+    if 2.0 * energy[agree].sum() <= energy.sum():
         return None
     wide = np.convolve(agree, (1, 1, 1), "same") > 0
     if edges[-1] - edges[0] > 2.0 * np.pi * (1.0 - 1.5 / bins):  # the ends of a whole turn are neighbours
@@ -529,7 +507,7 @@ def at_angle(balance: Balance, parts: Sequence[FloatArray], moments: View) -> Vi
 def _passes(place: Index, x: FloatArray, step_s: float) -> list[tuple[Index, FloatArray]]:
     """Return the stays of a run in a bin, each as (bins, residual): of all bins that it visits."""
     every = [np.flatnonzero(place == k) for k in np.unique(place)]
-    stays = (np.split(at, np.flatnonzero(np.diff(at) > _JOIN_S / step_s) + 1) for at in every)
+    stays = (np.split(at, np.flatnonzero(np.diff(at) > BLOCK_S / step_s) + 1) for at in every)
     return [(place[stay], x[stay]) for each in stays for stay in each]
 
 
@@ -539,17 +517,17 @@ def seconds(balance: Balance, parts: Sequence[FloatArray]) -> View | None:
     """
     block, prediction, means = _block(balance.step_s), [], list[tuple[float, str, float]]()
     for run, x in zip(balance.runs, parts, strict=True):
-        cut = x[: len(x) // block * block].reshape(-1, block)
-        count = np.isfinite(cut).sum(axis=1)
-        mean, use = np.nansum(cut, axis=1) / np.maximum(count, 1), count > block // 2
+        mean = _means(x, block)
         prediction.append(np.zeros(len(x)))
-        prediction[-1][: len(mean) * block] = np.repeat(np.where(use, mean, 0.0), block)
-        middle = run.time_s[: len(mean) * block : block][use] + 0.5 * block * balance.step_s
-        means += [(abs(float(m)), run.name, float(t)) for m, t in zip(mean[use], middle, strict=True)]
-    square, least = np.array([m * m for m, _, _ in means]), (_WANDER * balance.rated_nm) ** 2
+        prediction[-1][: len(mean) * block] = np.repeat(np.nan_to_num(mean), block)
+        middle = run.time_s[: len(mean) * block : block] + 0.5 * block * balance.step_s
+        means += [(abs(float(m)), run.name, float(t)) for m, t in zip(mean, middle, strict=True)]
+    means = [each for each in means if math.isfinite(each[0])]
+    square = np.array([m * m for m, _, _ in means])
     if not means:
         return None
     far = square[square > _FAR * np.median(square)]
-    if np.mean(square) > least or np.sum(far) / len(square) > least / 9.0:
+    all_of_them = np.mean(square) > (RELEVANCE * balance.rated_nm) ** 2
+    if all_of_them or np.sum(far) / len(square) > balance.least_nm2:
         return _view("time", parts, prediction, what="seconds", times=_moments(means)[:6])
     return None

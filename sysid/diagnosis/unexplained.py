@@ -1,6 +1,6 @@
 """What remains of a residual, and where: the gaps of all balances, with noise floor, places and traces.
 
-What entries and the runs' own changes leave is searched for views (`structure.pursue`). Those that are found are both what
+What entries and run-to-run variation leave is searched for views (`structure.pursue`). Those that are found are both what
 remains, with energy and reasons, and where. Where nothing that remains matters, the places are those of the whole gap.
 """
 
@@ -21,15 +21,16 @@ from jtqd.sysid.diagnosis.entries import set_state
 from jtqd.sysid.diagnosis.findings import Gap, Place, Present, Trace, shows_at
 from jtqd.sysid.diagnosis.regressors import LINE, Index, binned, contribution
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
-from jtqd.sysid.diagnosis.structure import AXES, Balance, View, autoregression, events, pursue
+from jtqd.sysid.diagnosis.structure import AXES, Balance, View, events, pursue
 
 _MOST_OF_THE_TIME: Final = 0.1
 """What takes more of the time than this is no event but a condition."""
 _TRACE_POINTS: Final = 4000
+"""Samples of a run in a picture."""
 QUADRANT_NAMES: Final = ("v+ load+", "v+ load-", "v- load+", "v- load-")
 _SHARED: Final = 5.0
-"""Standard deviations of the mean over runs, of days that differ as usual, beyond which all runs have it in common."""
-_OF_A_DAY: Final = ("zero", "viscous", "coulomb")
+"""Standard deviations of the mean of the usual run-to-run variation beyond which all runs have it in common."""
+_SHAREABLE: Final = ("zero", "viscous", "coulomb")
 """Families that are the joint's where all runs share them; a torsion's zero is nobody's, `smooth` is what is near rest."""
 Parts = list[FloatArray]
 """A residual [run][n], NaN where it is not valid."""
@@ -57,41 +58,27 @@ class Remaining:
     own: FloatArray
 
     @cached_property
-    def own_changes(self) -> FloatArray:
-        """The runs' own changes [r, q], without strange lines. Of a family that all runs have far more of than days differ
-        by, only what each has beside the others: what all share is the joint's, and unexplained where no cause covers it.
+    def run_to_run(self) -> FloatArray:
+        """Run-to-run variation [r, q], without unknown lines. Of a family that all runs have far more of than runs vary by,
+        only what each has beside the others: what all share is the joint's, and unexplained where no cause covers it.
         """
         families, pieces = self.dataset.families, np.array(self.dataset.recordings)
         changes = np.where([g.name == LINE for g in families], 0.0, self.own)
         runs = np.array([changes[pieces == r].mean(axis=0) for r in np.unique(pieces)])
-        sigma = np.array([g.sigma if g.name in _OF_A_DAY else np.inf for g in families])
+        sigma = np.array([g.sigma if g.name in _SHAREABLE else np.inf for g in families])
         shared = runs.mean(axis=0)
         shared[np.abs(shared) < _SHARED * sigma / np.sqrt(len(runs))] = 0.0
         return np.asarray(changes - shared)
 
     @cached_property
-    def less_own(self) -> dict[Channel, Parts]:
-        """The residual less the runs' own changes but not less strange lines, events with it."""
+    def less_variation(self) -> dict[Channel, Parts]:
+        """The residual less run-to-run variation but not less unknown lines, events with it."""
         out = {}
         for channel, parts in self.residual.items():
             data = self.dataset.of(channel)
-            changes = [d.nuisances @ u[d.families] for d, u in zip(data, self.own_changes, strict=True)]
+            changes = [d.nuisances @ u[d.families] for d, u in zip(data, self.run_to_run, strict=True)]
             out[channel] = self.dataset.shown(channel, [x - y for x, y in zip(parts, changes, strict=True)])
         return out
-
-    @cached_property
-    def after(self) -> dict[Channel, Parts]:
-        """The residual less what each run has of its own where that makes it smaller: of few seconds its estimate under a
-        prior need not.
-        """
-
-        def smaller(x: FloatArray, y: FloatArray) -> FloatArray:
-            return min(x, y, key=lambda each: float(np.nansum(each**2)))
-
-        return {
-            c: [*map(smaller, self.less_own[c], self.dataset.shown(c, parts))]
-            for c, parts in self.residual.items()
-        }
 
     @cached_property
     def before(self) -> dict[Channel, Parts]:
@@ -101,7 +88,7 @@ class Remaining:
                 x + d.residual - left
                 for x, d, left in zip(parts, self.dataset.of(c), self.residual[c], strict=True)
             ]
-            for c, parts in self.after.items()
+            for c, parts in self.less_variation.items()
         }
 
 
@@ -160,18 +147,15 @@ def _name(view: View) -> str:
 
 
 def unexplained_residual(left: Remaining) -> Unexplained:
-    """Return the unexplained residual when causes and the runs' own changes are taken out."""
-    balances = _balances(left.dataset, left.less_own)
-    found = {c: pursue(balances[c], x) for c, x in left.less_own.items()}
+    """Return the unexplained residual when causes and run-to-run variation are taken out."""
+    balances = _balances(left.dataset, left.less_variation)
+    found = {c: pursue(balances[c], x) for c, x in left.less_variation.items()}
     return Unexplained({c: views for c, views in found.items() if views}, balances)
 
 
 def _balances(dataset: Dataset, residuals: Mapping[Channel, Parts]) -> dict[Channel, Balance]:
     rated = {c: dataset.joints[c.joint].rated_torque_nm for c in residuals}
-    return {
-        c: Balance(dataset.runs, c, autoregression(parts), dataset.step_s, rated[c])
-        for c, parts in residuals.items()
-    }
+    return {c: Balance(dataset.runs, c, dataset.step_s, rated[c]) for c in residuals}
 
 
 def events_left(left: Remaining) -> dict[Channel, View]:
@@ -186,7 +170,7 @@ def events_left(left: Remaining) -> dict[Channel, View]:
         found = {c: events(balances[c], parts) for c, parts in residuals.items()}
         return {c: e for c, e in found.items() if e and e.energy_nm2 > balances[c].least_nm2}
 
-    found = large(left.dataset.unexplained) if large(left.less_own) else {}
+    found = large(left.dataset.unexplained) if large(left.less_variation) else {}
     return {c: e for c, e in found.items() if np.mean(np.concatenate(e.masks)) < _MOST_OF_THE_TIME}
 
 
@@ -212,13 +196,11 @@ def channel_gaps(left: Remaining, found: Unexplained, matters: bool) -> tuple[Ga
     else with those of the whole gap, the largest excess over the floor first.
     """
     # where the gap lives: without what each run has of its own, which would hide a small effect
-    shown = left.less_own if matters else left.before
+    shown = left.less_variation if matters else left.before
     out = []
     for channel, balance in found.balances.items():
         x, rmse = shown[channel], _rms(_raw(left.dataset, channel))
-        floor = min(
-            _floor(left, channel), rmse
-        )  # changes from run to run that work against each other are not noise
+        floor = min(_floor(left, channel), rmse)  # variation of runs that cancels is no noise
         noise = _rms(left.dataset.unexplained[channel])
         views = found.views.get(channel, ()) if matters else pursue(balance, x)
         ranked = [_places(v, x, noise, max(rmse**2 - noise**2, 1e-30)) for v in views]
@@ -273,7 +255,7 @@ def _raw(dataset: Dataset, channel: Channel) -> Parts:
 def _floor(left: Remaining, channel: Channel) -> float:
     """Return the noise floor [Nm]: what no effect explains, and run-to-run variation."""
     drift = []
-    for d, u in zip(left.dataset.of(channel), left.own_changes, strict=True):
+    for d, u in zip(left.dataset.of(channel), left.run_to_run, strict=True):
         part = (d.nuisances @ u[d.families])[d.valid]
         drift.append(part - part.mean() if channel.balance == TORSION and len(part) else part)
     square = float(np.mean(np.concatenate(drift) ** 2)) if any(map(len, drift)) else 0.0
@@ -289,7 +271,7 @@ def traces(left: Remaining) -> tuple[Trace, ...]:
         for c in run.channels:
             axes = run.axes[c.joint]
             measured = binned(_measured(signals[c.joint], c.balance), run.samples)
-            curves = (left.before[c][r], left.after[c][r], axes["velocity"], measured)
+            curves = (left.before[c][r], left.less_variation[c][r], axes["velocity"], measured)
             shown = [x[::every] for x in (run.time_s, *curves)]
             out.append(Trace(run.name, c.joint, c.balance, *shown))
     return tuple(out)

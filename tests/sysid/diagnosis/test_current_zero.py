@@ -98,8 +98,8 @@ def test_the_reading_is_the_mean_of_the_rest_without_its_ends_and_with_its_noise
 
 def test_no_mark_or_a_short_rest_is_no_reading() -> None:
     assert reading(signals(bench_run(0.2, marked=False))) is None
-    assert reading(signals(bench_run(0.2, rest_s=0.45))) is None
-    assert reading(signals(bench_run(0.2, rest_s=0.55))) is not None
+    assert reading(signals(bench_run(0.2, rest_s=0.28))) is None
+    assert reading(signals(bench_run(0.2, rest_s=0.32))) is not None
 
 
 def test_what_the_joint_file_knows_of_its_offset_is_taken_off() -> None:

@@ -15,7 +15,6 @@ from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, run_da
 
 STEP_S = 0.005
 COUNT = 4000
-AR = np.array([0.9])
 Residual = Callable[[dict[str, FloatArray], int], FloatArray]
 
 
@@ -52,7 +51,7 @@ def found(residual: Residual, channel: Channel = MOTOR1, seed: int = 0) -> list[
     runs: list[RunData] = [
         run_data(f"run{k}", {channel: x}, a) for k, (x, a) in enumerate(zip(parts, axes, strict=True))
     ]
-    return pursue(Balance(runs, channel, AR, STEP_S, 50.0), parts)
+    return pursue(Balance(runs, channel, STEP_S, 50.0), parts)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The noise of channels against known processes, the normal equations against stacked rows, the autoregression."""
+"""The noise of channels against known processes, the normal equations against stacked rows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from jtqd.sysid.diagnosis.regressors import (
     saturated_residuals,
 )
 from jtqd.sysid.diagnosis.signals import Channel
-from jtqd.sysid.diagnosis.structure import AR_ORDER, autoregression, past_valid, whiten
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, run_data
 
 MOTOR2 = Channel(2, "motor")
@@ -27,38 +26,6 @@ def coloured(a: FloatArray, noise: FloatArray) -> FloatArray:
         past = out[max(0, t - len(a)) : t][::-1]
         out[t] = e + a[: len(past)] @ past
     return out
-
-
-def padded(*a: float) -> FloatArray:
-    return np.concatenate((a, np.zeros(AR_ORDER - len(a))))
-
-
-def test_coefficients_of_an_autoregression_come_back_through_gaps() -> None:
-    rng = np.random.default_rng(3)
-    truth = np.array([1.3, -0.6])
-    series = [coloured(truth, rng.normal(size=12000)) for _ in range(3)]
-    for x in series:
-        for start in rng.integers(0, 11000, 8):
-            x[start : start + 400] = np.nan
-    assert autoregression(series, 2) == pytest.approx(truth, abs=0.02)
-    assert autoregression(series) == pytest.approx(padded(*truth), abs=0.05), "and nothing beyond its order"
-    assert autoregression([rng.normal(size=20000)], 3) == pytest.approx(np.zeros(3), abs=0.03)
-
-
-def test_whitening_undoes_the_autoregression() -> None:
-    rng = np.random.default_rng(4)
-    e = rng.normal(size=(300, 2))
-    a = np.array([0.9, -0.3, 0.0, 0.2])
-    x = np.column_stack([coloured(a, e[:, k]) for k in (0, 1)])
-    assert whiten(x, a) == pytest.approx(e, abs=1e-12)
-
-
-@pytest.mark.parametrize("order", [1, 3, 7])
-def test_a_row_counts_when_its_past_is_known(order: int) -> None:
-    valid = np.random.default_rng(5).random(200) < 0.9
-    slow = [t >= order and bool(valid[t - order : t + 1].all()) for t in range(200)]
-    assert past_valid(valid, order).tolist() == slow
-    assert not past_valid(np.ones(order, bool), order).any(), "shorter than its past"
 
 
 NOISE = Noise({MOTOR1: 0.5, TORSION1: 2.0, MOTOR2: 1.0}, 1.5)

@@ -135,11 +135,11 @@ def test_a_run_is_odd_by_what_sets_it_apart(own: float, strange: float, odd: boo
         row[:, 2] = 0.7 * row[:, 0] + (own * row[:, 1] + strange * row[:, 2] if k == 2 else row[:, 2])
     comparison = Comparison(np.array([row.T @ row for row in rows]), np.full(5, 2000.0), 1, np.zeros((5, 1)))
     assert comparison.drop([0], [(2, 0)], 2, 0) > 300.0, "certain in both cases"
-    assert comparison.explains_what_is_apart([0], [(2, 0)], (2, 0)) == odd
+    assert comparison.explains_excess([0], [(2, 0)], (2, 0)) == odd
 
 
 def test_a_run_that_is_set_apart_by_something_else_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Comparison, "explains_what_is_apart", lambda *_: False)
+    monkeypatch.setattr(Comparison, "explains_excess", lambda *_: False)
     assert diagnose(changed(runs(), [2], current_gain), {1: PLAIN}).outlier_runs == ()
 
 
