@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo hidden-effect docs deb release test test-here test-hidden test-guest test-native test-sanitized test-all mutants bench bench-kernel kernel-with-vcan fuzz soak soak-exact lint style types format clean
+.PHONY: help setup demo hidden-effect docs deb release test test-here test-hidden test-guest test-native test-alone test-sanitized test-all mutants bench bench-kernel kernel-with-vcan fuzz soak soak-exact lint style types format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -27,11 +27,13 @@ test: style ## everything but the tests marked campaign
 	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part.
 	$(BIN)/python -m compileall -q daemon drivers estimator models sim_can sysid tests tools validation
 	@status=0; \
-	$(MAKE) --no-print-directory -k -j2 --output-sync=target test-guest test-here test-hidden types || status=$$?; \
-	$(MAKE) --no-print-directory test-native || status=$$?; \
+	$(MAKE) --no-print-directory -k -j3 --output-sync=target test-native test-here test-guest test-hidden types || status=$$?; \
+	$(MAKE) --no-print-directory test-alone || status=$$?; \
 	exit $$status
 
-# Two at a time, each with one thread: the bench kernel keeps a time of its own, so neither feels the other.
+# Two that compute, each with one thread, beside one that mostly waits and comes before them: the bench kernel keeps a time of
+# its own, so none feels the others.
+BEHIND := nice -n 10
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 # In the lane of the guest, which is the shorter one.
 HIDDEN := tests/validation tests/examples tests/sysid/batch
@@ -41,17 +43,21 @@ SLOWEST := --durations=20 --durations-min=2
 MARKED = $(shell grep -rlE --include='test_*.py' 'mark\.($(1))\b' tests | sort)
 
 test-here:
-	$(ONE_THREAD) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN:%=--ignore=%)
+	$(ONE_THREAD) $(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN:%=--ignore=%)
 
 test-hidden:
-	$(ONE_THREAD) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN)
+	$(ONE_THREAD) $(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN)
 
 test-guest: kernel-with-vcan
-	$(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign" $(call MARKED,socketcan|boots)
+	$(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign" $(call MARKED,socketcan|boots)
 
-# Loops of 1 kHz at the pace of this machine's clock: nothing beside them.
+# Processes at the pace of this machine's clock: most of the time they wait.
 test-native:
-	$(BIN)/python -m pytest $(SLOWEST) -m "native and not (campaign or socketcan or boots)" $(call MARKED,native)
+	$(BIN)/python -m pytest $(SLOWEST) -m "native and not (measures or campaign or socketcan or boots)" $(call MARKED,native)
+
+# What they do within a time, or how often: nothing beside them.
+test-alone:
+	$(BIN)/python -m pytest $(SLOWEST) -m "measures and not (campaign or socketcan or boots)" $(call MARKED,measures)
 
 test-all: lint kernel-with-vcan ## everything: also the long tests, two releases that must be equal, the mutants, the sanitizers
 	$(BIN)/python -m pytest
@@ -92,7 +98,7 @@ soak-exact: $(VENV)/.installed-dev ## the same in the bench kernel: as much gues
 	$(BIN)/python -m tests.slow.soak --exact --minutes 1440 --wall 3600
 
 kernel-with-vcan: $(VENV)/.installed-test
-	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
+	$(BEHIND) $(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
 
 bench-kernel: $(VENV)/.installed ## build the kernel with SocketCAN into the cache, once
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build

@@ -93,6 +93,6 @@ def test_an_unmarked_test_is_never_tried_again(pytester):
 
 def test_the_mark_of_a_lane_stands_in_the_file_of_its_tests():
     """The Makefile gives a lane the files that name its mark: a test with a mark from elsewhere would be in none."""
-    named = re.compile(r"\bmark\.(socketcan|boots|native)\b|getattr\(pytest\.mark")
+    named = re.compile(r"\bmark\.(socketcan|boots|native|measures)\b|getattr\(pytest\.mark")
     elsewhere = [path for path in (ROOT / "tests").rglob("*.py") if not path.name.startswith("test_")]
     assert [path.name for path in elsewhere if named.search(path.read_text())] == []

@@ -26,7 +26,9 @@ def compiler() -> str:
     "method",
     [
         # the cycle has method `fused` of two joints in it
-        pytest.param(each, marks=pytest.mark.native if each == CYCLE else pytest.mark.campaign)
+        pytest.param(
+            each, marks=[pytest.mark.native, pytest.mark.measures] if each == CYCLE else pytest.mark.campaign
+        )
         for each in (*METHODS, CYCLE, *SHADOWS)
     ],
 )

@@ -113,6 +113,7 @@ class Run:
         return found
 
 
+@pytest.mark.measures
 @pytest.mark.parametrize(
     ("joints", "sensor"),
     [

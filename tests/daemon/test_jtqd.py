@@ -640,6 +640,7 @@ print(began, last, longest)
 """
 
 
+@pytest.mark.measures
 def test_a_processor_hog_costs_counted_cycles_and_nothing_that_is_published_is_stale(
     tmp_path: Path, environment: dict[str, str]
 ) -> None:

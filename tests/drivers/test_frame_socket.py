@@ -201,6 +201,7 @@ def test_kernel_stamps_are_wall_clock_and_monotonic(bench):
         assert stamps == sorted(stamps)
 
 
+@pytest.mark.measures
 def test_stamp_is_taken_at_arrival_not_at_reading(bench):
     a, b = bench.open(), bench.open()
     a.send(SYNC)

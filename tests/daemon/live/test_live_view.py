@@ -263,6 +263,7 @@ def test_a_viewer_that_goes_without_a_word_and_garbage_are_no_trouble(shared):
     viewer.leave()
 
 
+@pytest.mark.measures
 def test_without_a_viewer_it_reads_no_cycle(memory):
     with LiveProcess(memory.directory) as live:
         memory.feed(500)
@@ -290,6 +291,7 @@ def test_a_process_that_cannot_begin_answers_why(memory, changes, part):
             assert part in live.answer["failed"]
 
 
+@pytest.mark.measures
 def test_it_ends_on_sigterm(memory):
     with LiveProcess(memory.directory) as live:
         Viewer(live.url)

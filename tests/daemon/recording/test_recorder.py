@@ -125,6 +125,7 @@ def test_file_as_a_whole(recorder, tmp_path):
     assert velocity[0] == pytest.approx(joint_values(0, 1)[2] / 50.0)
 
 
+@pytest.mark.measures
 def test_stopped_recorder_loses_and_counts(recorder):
     """SIGSTOP for longer than the ring: what is missing in the file is in the account and the events."""
     process = recorder(slots=256)

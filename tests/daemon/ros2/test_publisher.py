@@ -92,6 +92,7 @@ def test_nodes_of_this_machine_find_it_in_any_order(memory, discovery):
         second.wait_for("joint_states")
 
 
+@pytest.mark.measures
 def test_100_messages_a_second_while_the_loop_runs_and_no_old_torque_when_it_stands_still(memory):
     with Reader() as reader, Publisher(memory.directory):
         thread = memory.feeding(3000)
@@ -115,6 +116,7 @@ def test_100_messages_a_second_while_the_loop_runs_and_no_old_torque_when_it_sta
         reader.until(lambda: reader.messages("joint_torque_states")[-1]["status"] == [2, 2])
 
 
+@pytest.mark.measures
 def test_a_reader_that_is_stopped_holds_up_nobody(memory):
     with Reader() as stopped, Reader() as reader, Publisher(memory.directory):
         memory.feeding(5000)
