@@ -141,10 +141,16 @@ def check(summaries: dict[str, dict[str, Any]]) -> None:
 
 @pytest.mark.socketcan
 @pytest.mark.usefixtures("interfaces")
-def test_seven_joints_on_four_buses_are_valid_at_once(tmp_path: Path) -> None:
-    summaries, at_once = run(tmp_path, BUSES)
+@pytest.mark.parametrize(
+    "buses", [("vcan0", "vcan3"), pytest.param(tuple(BUSES), marks=pytest.mark.campaign)], ids=len
+)
+def test_joints_on_several_buses_are_valid_at_once(tmp_path: Path, buses: tuple[str, ...]) -> None:
+    """All seven on four, or three on two: with a sensor and without, two on a bus and one."""
+    summaries, at_once = run(tmp_path, {bus: BUSES[bus] for bus in buses})
     check(summaries)
-    assert sum(len(summary["rmse_nm"]) for summary in summaries.values()) == 7
+    assert sum(len(summary["rmse_nm"]) for summary in summaries.values()) == (
+        7 if buses == tuple(BUSES) else 3
+    )
     assert at_once > 0
 
 
