@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ import yaml
 from examples.own_rig import DATA_SHEET, TRUE
 from examples.own_rig import main as own_rig
 from jtqd.daemon.jtq import main as jtq
-from jtqd.models.files import load_joint
+from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.simulators import mjcf, model_of
@@ -35,10 +36,13 @@ def logs(folder: Path) -> None:
     """Two logs of jtqd on the emulated bench's equations; each has lost 0.3 s."""
     folder.mkdir()
     for number, phase in enumerate((0.0, 0.9), 1):
-        table = bench_run(seconds=6.0, phase=phase)
-        columns = [table.joints[n] for n in (1, 2)]
+        sides = [
+            bench_run(load_joint(shipped(f"joint{n}.yaml")), 6.0, phase, numbers=(n,)).joints[n]
+            for n in (1, 2)
+        ]
+        columns = [replace(c, torque_nm=sides[0].torque_nm) for c in sides]
         cycles = []
-        for k in range(len(table.time_s)):
+        for k in range(3000):
             if 1500 <= k < 1650:
                 continue
             joints = []
@@ -48,7 +52,7 @@ def logs(folder: Path) -> None:
                 assert c.link_position_rad is not None
                 assert c.torque_nm is not None
                 before = c.motor_position_rad[max(k - 1, 0)]
-                after = c.motor_position_rad[min(k + 1, len(table.time_s) - 1)]
+                after = c.motor_position_rad[min(k + 1, 2999)]
                 joints.append(
                     LogJoint(
                         float(c.current_a[k]),
