@@ -77,7 +77,7 @@ def test_arguments_that_would_judge_nothing_are_refused(
     arguments: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as refused:
-        main(["--per-row", "1", "--pairs", "0", *arguments])
+        main(["--seed", str(PRACTICE), "--per-row", "1", "--pairs", "0", *arguments])
     assert refused.value.code == 2
     assert "error: " in capsys.readouterr().err
 
