@@ -40,7 +40,7 @@ def test_found_and_gained(
     bus: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    options = ["--runs", "4", "--fresh-runs", "2", "--seconds", "10", "--json"]
+    options = ["--runs", "3", "--fresh-runs", "2", "--seconds", "8", "--json"]
     assert main(["--effect", "torque_constant", "--bus", bus, "--out", str(tmp_path / "demo"), *options]) == 0
     check(json.loads(capsys.readouterr().out))
 
