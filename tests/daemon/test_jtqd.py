@@ -427,6 +427,7 @@ def test_a_wrong_gear_ratio_is_refused(tmp_path: Path, environment: dict[str, st
     assert "6091h gear ratio: expected 120" in no_traceback(result)
 
 
+@pytest.mark.measures
 def test_an_estimate_far_from_the_sensor_is_said_once_and_counted(
     tmp_path: Path, environment: dict[str, str], bench: str
 ) -> None:
