@@ -305,10 +305,11 @@ def _fit_losses(joint: Joint, number: int, runs: list[RunFile], options: argpars
         teacher = fit_teacher(signals, joint, two_encoders=two)
         if refusal := teacher.refusal(joint):
             return Outcome(log=[refusal], status=3)
-        signals, said = [teacher.complete(run) for run in signals], teacher.lines(joint, two_encoders=two)
+        signals = [teacher.complete(run) for run in signals]
+        arm = teacher.lines(joint, two_encoders=two)
         two = two and teacher.stiffness_share <= STIFFNESS_KNOWN
         few = (not two and len(runs) <= MOST_RUNS) or teacher.load_nm < WEIGHT * joint.rated_torque_nm
-        return _losses(joint, signals, runs, said, two=two, few=few)
+        return _losses(joint, signals, runs, arm, two=two, few=few)
     except (LossFitError, TorsionError) as error:
         return Outcome(log=[str(error)], status=3)
 
@@ -317,15 +318,15 @@ def _losses(
     joint: Joint,
     signals: Sequence[RunSignals],
     runs: Sequence[RunFile],
-    said: Sequence[str],
+    arm: Sequence[str],
     *,
     two: bool,
     few: bool,
 ) -> Outcome:
-    """Return the outcome of a fit to signals with a teacher. said: of known loads; few: with the priors of few runs."""
+    """Return the outcome of a fit to signals with a teacher. arm: report on known loads; few: with priors of few runs."""
     if few:
         found = fit_few_runs(signals, joint)
-        lines, log = _few_lines(found), [FEW_RUNS] if said else [ONE_ENCODER, FEW_RUNS]
+        lines, log = _few_lines(found), [FEW_RUNS] if arm else [ONE_ENCODER, FEW_RUNS]
         new, unseen = found.joint, [found.held_out_nm]
         sigma_per_k, samples = PER_K_PRIOR[1], found.samples
         notes: dict[str, Any] = {"few_runs": found.lines(), "rotor_inertia_kgm2": "fitted, too"}
@@ -336,7 +337,7 @@ def _losses(
         }
     else:
         fit = fit_fused(signals, joint, two_encoders=two)
-        lines, log = _fused_lines(joint, fit), [] if two or said else [ONE_ENCODER]
+        lines, log = _fused_lines(joint, fit), [] if two or arm else [ONE_ENCODER]
         new, unseen = replace(joint, fused=fit.fused), list(fit.held_out_rmse_nm)
         sigma_per_k, samples = fit.loss.viscous_per_k_sigma, fit.loss.samples
         notes, more = {}, {}
@@ -350,9 +351,9 @@ def _losses(
         "fused": new.fused.to_mapping(),
     }
     notes = {"unseen_rmse_nm": round(_together(unseen), 4), **notes}
-    notes |= {"known_loads": list(said)} if said else {}
+    notes |= {"known_loads": list(arm)} if arm else {}
     new = _fitted(new, "fused", runs, "losses", new.fused.loss.temperature_c, **notes)
-    return Outcome([*lines, *(f"  {line}" for line in said)], mapping, log, new)
+    return Outcome([*lines, *(f"  {line}" for line in arm)], mapping, log, new)
 
 
 def _few_lines(fit: FewRunsFit) -> list[str]:
