@@ -23,7 +23,7 @@ from jtqd.estimator.fusion cimport (
     Checkpoint, Fused, Learned, Rest, TURN_WAVES, apart_nm2, at_rest, degrades, drop_block, early_factor, fading,
     fill_agreement, fill_fusion, fill_offsets, fill_proof, fuse_paths, gather, implausible, keep_offsets, known_nm2,
     local_stiffness, mismatch_variance, offsets_of, pause_turn, possible_error, prove, report_offsets, restart_agreement,
-    restart_offsets, restart_proof, restart_turn, reweigh, turn_differs, unlearned_nm2, unproven_nm2, update_difference, update_turn
+    restart_offsets, restart_proof, restart_turn, reweigh, turn_differs, unproven_nm2, update_difference, update_turn
 )
 from jtqd.estimator.native_network cimport (
     PATH_INPUTS, Perceptron, evaluate, fill_fused_trust, fill_path, fill_trust, follow_path, fused_trust, path_trust,
@@ -505,7 +505,8 @@ cdef class FusedEstimator(Estimator):
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
-        cdef double scale, view, trusted = 1.0, difference, mismatch = 0.0, known = 0.0, early = 1.0, share = 1.0
+        cdef double scale, view, trusted = 1.0, difference, known = 0.0, early = 1.0, share = 1.0
+        cdef double spread, more, mismatch, variance, unproven
         cdef bint standing = out.status == STANDSTILL, alone = not law.fusion.with_torsion
         cdef int quadrant = quadrant_of(raw, v)
         cdef Loss loss
@@ -551,38 +552,30 @@ cdef class FusedEstimator(Estimator):
                 degraded = True
         elif law.network.used:
             degraded = True
-        out.sigma_nm = scale * (best.sigma * early)
+        spread = scale * best.sigma * early
         # an uncorrected offset counts once: as mismatch, where the file has section agreement
-        wider = apart_nm2(&best, 0.0 if law.agreement.used else s.offsets.uncorrected_nm)
-        if wider > 0.0:
-            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + wider)
+        more = apart_nm2(&best, 0.0 if law.agreement.used else s.offsets.uncorrected_nm)
+        variance = spread * spread + more
         if law.agreement.used:
             mismatch = mismatch_variance(&s.agreement, best.alpha, seen.torsion_nm)
             if degrades(
-                &law.agreement, &s.agreement, &s.offsets, mismatch, out.sigma_nm, best.alpha, seen.torsion_nm
+                &law.agreement, &s.agreement, &s.offsets, mismatch, sqrt(variance), best.alpha, seen.torsion_nm
             ):
                 s.degraded_s, degraded = LOWERED_S, True
-            mismatch += unlearned_nm2(&s.agreement, best.alpha, known)
-            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + mismatch)
+            more += mismatch
+            variance += mismatch
         if s.inputs.doubt > DOUBTFUL * law.inputs.tolerance:
             s.degraded_s, degraded = LOWERED_S, True
         if degraded:
             out.status = DEGRADED
         elif standing and alone and law.network.used:
-            out.sigma_nm = hypot(law.rest, 2.0 * (1.0 - trusted) * law.outside)
+            variance = law.rest * law.rest + (2.0 * (1.0 - trusted) * law.outside) ** 2
         elif standing:
-            out.sigma_nm = self.half_interval(seen, &physics, loss.half, wider + mismatch, out.sigma_nm)
+            variance = self.half_interval(seen, &physics, loss.half, more, sqrt(variance)) ** 2
         if law.tracked and out.status != STANDSTILL:  # measured in motion; of the torsion, by its share
-            out.sigma_nm = sqrt(
-                out.sigma_nm * out.sigma_nm
-                + share * law.tracking_noise
-                + share * law.tracking_viscous * v * v / (1.0 + law.tracking_bend * v * v)
-            )
-        out.sigma_nm = sqrt(
-            out.sigma_nm * out.sigma_nm
-            + unproven_nm2(&law.proof, &s.proof, best.alpha, s.offsets.link_rad, seen.ahead_nm)
-            + s.inputs.doubt * s.inputs.doubt
-        )
+            variance += share * (law.tracking_noise + law.tracking_viscous * v * v / (1.0 + law.tracking_bend * v * v))
+        unproven = unproven_nm2(&law.proof, &s.proof, best.alpha, s.offsets.link_rad, seen.ahead_nm)
+        out.sigma_nm = sqrt(variance + unproven + s.inputs.doubt * s.inputs.doubt)
         publish_within(out, law.limit)
 
     cdef double half_interval(

@@ -166,7 +166,6 @@ cdef void update_turn(
 ) noexcept nogil
 cdef bint turn_differs(const AgreementLaw *law, const AgreementState *s) noexcept nogil
 cdef double mismatch_variance(const AgreementState *s, double alpha, double torsion) noexcept nogil
-cdef double unlearned_nm2(const AgreementState *s, double alpha, double known) noexcept nogil
 cdef bint degrades(
     const AgreementLaw *law,
     const AgreementState *s,

@@ -72,6 +72,8 @@ def track_run(
     direction: FloatArray,
     slope: FloatArray,
     stiffness: FloatArray,
+    ahead_nm: FloatArray,
+    resting: BoolArray,
     tracked: bool = True,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]: ...
 def turn_waves(

@@ -15,9 +15,8 @@ the half width of the interval is
 
     k sd + alpha open + (1 - alpha) half   k: `fused.standstill`; sd: sigma without `half` and `open`, with the same alpha
 
-A disagreement of the paths widens sigma by max(alpha, 1 - alpha) (|tau_t - tau_c| - DISAGREE_SIGMAS sqrt(s_c^2 + s_t^2)),
-where that is above 0: which path is wrong is not known, so the worse case counts. Near standstill `half` is a bound and not
-a part of the standard deviation.
+A disagreement of the paths widens sigma by max(alpha, 1 - alpha) (|tau_t - tau_c| - half - DISAGREE_SIGMAS sqrt(s_c^2 - half^2
++ s_t^2)), where that is above 0: which path is wrong is not known, so the worse case counts. Near standstill `half` is a bound.
 
 **Proof.** The offset of the torsion is any value up to the rated torque until the paths have shown a smaller one. U: what the
 torsion may be off by, a bound of 3 standard deviations in sigma:
@@ -126,7 +125,7 @@ cdef double BOUNDING = 3.0, PER_BOUND = 1.0 / BOUNDING**2  # standard deviations
 cdef double PROVING_S = 0.1  # in which paths that agree prove the torsion
 cdef double RESTING_SHARE = 0.025  # of the rated torque, by which the torsion changes at rest from noise
 cdef double DAYS = 2.0  # spreads of the link's offset over the days
-cdef double AHEAD = 0.1  # part of what the torsion is ahead by
+cdef double AHEAD = 0.05  # part of what the torsion is ahead by
 cdef double LEAST_VARIANCE = 0.05  # part of the torsion's variance that remains, however well its offset is known
 
 
@@ -858,11 +857,6 @@ cdef double mismatch_variance(const AgreementState *s, double alpha, double tors
     return _by_share(alpha, s.mismatch, s.gain_mismatch, torsion)
 
 
-cdef double unlearned_nm2(const AgreementState *s, double alpha, double known) noexcept nogil:
-    """Return the addition to sigma^2 [Nm^2] by an offset that was learned, `known` [Nm^2], while the paths disagree."""
-    return alpha * alpha * fmin(known, s.mismatch)
-
-
 cdef bint degrades(
     const AgreementLaw *law,
     const AgreementState *s,
@@ -918,22 +912,27 @@ def levels(fused, double rated_nm, dt_s, difference_nm, direction, velocity_rad_
 
 def track_run(
     fused, rated_nm, dt_s, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm, difference_nm, direction, slope, stiffness,
-    bint tracked=True
+    ahead_nm, resting, bint tracked=True
 ):
     """Return (alpha, torsion, current, spread, more, known) of a run from its start, as the estimator has them at each sample.
 
     alpha: share of the torsion; torsion, current: corrections of both paths [Nm]; spread: standard deviation of the value [Nm],
-    scale 1, with `early`; more: what widens it [Nm^2]; known: reduction of s_t^2 [Nm^2]. Arrays [n] of samples in motion, `fused`
-    with a torsion. difference_nm: torsion less current path; slope: dL/draw of the loss; stiffness: d tau_t/d d of the spring
-    [Nm/rad]. tracked: offsets are corrected.
+    scale 1, with `early`; more: what widens it [Nm^2]; known: reduction of s_t^2 [Nm^2]. Arrays [n] of all samples, `fused` with
+    a torsion. difference_nm: torsion less current path; slope: dL/draw of the loss; stiffness: d tau_t/d d of the spring
+    [Nm/rad]; ahead: change of the torsion since the current path [Nm]; resting: standing samples. tracked: offsets are corrected.
     """
     columns = (
-        dt_s, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm, difference_nm, direction, slope, stiffness
+        dt_s, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm, difference_nm, direction, slope, stiffness,
+        ahead_nm
     )
     cdef const double[:, ::1] x = np.ascontiguousarray(np.column_stack(columns), np.float64)
     out = np.zeros((6, x.shape[0]))
+    cdef const unsigned char[::1] rests = np.ascontiguousarray(resting, np.bool_).view(np.uint8)
     cdef double[:, ::1] to = out
     cdef FusionLaw paths
+    cdef ProofLaw proof_law
+    cdef ProofState proof
+    cdef FusedObserved seen
     cdef OffsetLaw law
     cdef OffsetState s
     cdef AgreementLaw levels_law
@@ -946,19 +945,26 @@ def track_run(
     # the current offset counts as a torque: its part of the difference does not depend on the torque per ampere
     fill_offsets(&law, 1.0, rated_nm, fused, tracked, True)
     fill_agreement(&levels_law, fused.agreement, rated_nm)
+    fill_proof(&proof_law, rated_nm, fused)
     restart_offsets(&law, &s)
     restart_agreement(&agreement)
+    restart_proof(&proof_law, &proof)
     for k in range(x.shape[0]):
         to[1, k], to[2, k] = x[k, 9] * s.link_rad, -(1.0 - x[k, 8]) * s.current_a
         raw, torsion, difference = x[k, 1] - s.current_a, x[k, 4] + to[1, k], x[k, 6] + to[1, k] - to[2, k]
         physics = fuse_paths(&paths, raw, raw - torsion + difference, x[k, 2], x[k, 3], torsion, x[k, 5])
-        if gather(&s, x[k, 0], difference, x[k, 7], x[k, 3], torsion, physics.variance - law.spread_nm):
+        seen.raw_nm, seen.torsion_nm, seen.direction = raw, torsion, x[k, 7]
+        prove(&proof_law, &proof, &physics, &seen, x[k, 0], rests[k], True)
+        if rests[k]:
+            drop_block(&s)
+        elif gather(&s, x[k, 0], difference, x[k, 7], x[k, 3], torsion, physics.variance - law.spread_nm):
             update_difference(&law, &s, &levels_law, &agreement, x[k, 9], x[k, 8])
         known = known_nm2(&law, &s)
         if law.spread > 0.0:
             reweigh(&physics, known)
         to[0, k], to[3, k], to[5, k] = physics.alpha, physics.sigma * early_factor(&law, known), known
         to[4, k] = apart_nm2(&physics, 0.0 if levels_law.used else s.uncorrected_nm)
+        to[4, k] += unproven_nm2(&proof_law, &proof, physics.alpha, s.link_rad, x[k, 10])
         if levels_law.used:
-            to[4, k] += mismatch_variance(&agreement, physics.alpha, torsion) + unlearned_nm2(&agreement, physics.alpha, known)
+            to[4, k] += mismatch_variance(&agreement, physics.alpha, torsion)
     return tuple(out)

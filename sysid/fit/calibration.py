@@ -39,7 +39,8 @@ TORSION_BANDWIDTH_RAD_S: a tracked one is no noisier at rest.
 
 **Scale** (`calibrated`), the last step of a fit: factors of `fused.sigma` and `fused.zeros`, and `early` of the latter.
 
-    |error| <= 1.645 sqrt((scale_q spread)^2 + more^2)      in COVERAGE of the samples of a held-out run, quadrant q
+    |error| <= 1.645 sqrt((scale_q spread)^2 + more^2)      in COVERAGE of the samples of a held-out run, quadrant q,
+                                                            and in QUIET of those with the lesser half of more/spread
 
 error, spread, more: below; with the torsion tracked, `fused.tracking` is in more, so that it is not counted twice.
 scale_q is the conformal quantile of sqrt(error^2 - (1.645 more)^2) over the spread.
@@ -74,7 +75,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -85,6 +86,7 @@ from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Standstill, To
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S
+from jtqd.estimator.status import STANDSTILL
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import (
     TRACKING_RAD_S,
@@ -97,10 +99,11 @@ from jtqd.sysid.fit.torsion import (
 )
 
 NONE: Final = np.zeros(0)
+NEVER: Final = np.zeros(0, np.bool_)
 
 
 class PathResiduals(NamedTuple):
-    """One held-out run: arrays [n] of its moving samples, [Nm] and [rad/s].
+    """One held-out run: arrays [n] of its moving samples, or of all that were observed (`observed_run`), [Nm] and [rad/s].
 
     teacher: standard deviation of what errors are against, 0 for a sensor.
     half: width of the friction interval (`AdditiveLossModel.loss`). open: what the slip leaves open.
@@ -109,6 +112,7 @@ class PathResiduals(NamedTuple):
     tracked, delayed, low_pass: errors of the tracked torsion, of that through the motor path's filter, and of the torsion
     through the low pass of new configurations, against the unfiltered sensor: for `fused.tracking`.
     loss_nm, turn [n, 6] (filtered cos and sin of 1, 2 and 4 times the motor angle): for `fused.agreement.turn`.
+    ahead: of the tracked torsion to the delayed one. resting: standing. counted: in motion, and settled.
     """
 
     raw_nm: FloatArray
@@ -128,6 +132,14 @@ class PathResiduals(NamedTuple):
     loss_nm: FloatArray = NONE
     turn: FloatArray = NONE
     teacher_nm: FloatArray = NONE
+    ahead_nm: FloatArray = NONE
+    resting: BoolArray = NEVER
+    counted: BoolArray = NEVER
+
+    @property
+    def in_motion(self) -> PathResiduals:
+        """The run's samples that count."""
+        return _only(self, self.counted)
 
     @property
     def apart_nm(self) -> FloatArray:
@@ -152,6 +164,15 @@ class PathResiduals(NamedTuple):
         )
 
 
+Run = TypeVar("Run", "PathResiduals", "FusedErrors")
+
+
+def _only(run: Run, counted: BoolArray) -> Run:
+    """Return the samples of a run that count; empty: all."""
+    arrays: dict[str, Any] = run._asdict()
+    return run._replace(**{key: x[counted] for key, x in arrays.items() if len(x)}) if len(counted) else run
+
+
 def path_residuals(
     run: RunSignals, loss: AdditiveLoss, torsion: Torsion | None, keep: BoolArray | None = None
 ) -> PathResiduals:
@@ -168,6 +189,7 @@ def path_residuals(
     direction = seen.direction[keep]
     more, _ = AdditiveLossModel(loss).loss_many(raw + SLOPE_NM, velocity, seen.temperature_c[keep], direction)
     tracked = tracked_torque(torsion, run) - run.raw_sensor_nm
+    delayed = low_pass(tracked, seen.dt_s, run.bandwidth_rad_s)
     return PathResiduals(
         raw,
         velocity,
@@ -180,13 +202,21 @@ def path_residuals(
         direction=direction,
         slope=(more - loss_nm) / SLOPE_NM,
         tracked_nm=tracked[keep],
-        delayed_nm=low_pass(tracked, seen.dt_s, run.bandwidth_rad_s)[keep],
+        delayed_nm=delayed[keep],
         low_pass_nm=(low_pass_torque(torsion, run) - run.raw_sensor_nm)[keep],
         stiffness_nm_per_rad=local_stiffness(torsion, deflection(torsion, run)[keep]),
         loss_nm=loss_nm,
         turn=np.column_stack((seen.turn, seen.waves))[keep],
         teacher_nm=teacher,
+        ahead_nm=(tracked + run.raw_sensor_nm - delayed)[keep] - sensor,
+        resting=seen.status[keep] == STANDSTILL,
     )
+
+
+def observed_run(run: RunSignals, loss: AdditiveLoss, torsion: Torsion) -> PathResiduals:
+    """Return the errors of both paths on all observed samples: what the estimator knows depends on those at rest."""
+    observed = ~np.isnan(run.seen.raw_nm)
+    return path_residuals(run, loss, torsion, observed)._replace(counted=run.moving[observed])
 
 
 def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, FloatArray]:
@@ -222,7 +252,7 @@ def fused_errors(
 
     rated_nm None, or a joint without torsion: nothing is learned in the run, and nothing widens the spread.
     """
-    torsion, current, more, known = np.zeros((4, len(run.raw_nm)))
+    none = torsion = current = more = known = np.zeros(len(run.raw_nm))
     if rated_nm is None or fused.torsion is None or not len(run.dt_s):
         fusion = Fusion(replace(fused.sigma, reference_nm=0.0), fused.torsion is not None)
         alpha, _, spread, _ = fusion.fuse(*run.fusion_inputs)
@@ -236,13 +266,15 @@ def fused_errors(
             run.direction,
             run.slope,
             run.stiffness_nm_per_rad,
+            run.ahead_nm if fused.tracking is not None and len(run.ahead_nm) else none,
+            run.resting if len(run.resting) else none > 0.0,
             track_zeros,
         )
     e_c, e_t = run.current_error_nm + current, run.torsion_error_nm + torsion
     undelayed = NONE
     if len(run.tracked_nm):
         undelayed = run.tracked_nm + torsion + (1.0 - alpha) * (e_c - run.delayed_nm - torsion)
-    return FusedErrors(
+    errors = FusedErrors(
         e_c + alpha * (e_t - e_c),
         undelayed,
         spread,
@@ -252,6 +284,7 @@ def fused_errors(
         known,
         run.teacher_nm,
     )
+    return _only(errors, run.counted)
 
 
 COVERAGE: Final = 0.9
@@ -501,6 +534,8 @@ OTHER_MOTIONS: Final = 0.02
 OTHER_MOTIONS_LEARNED: Final = 0.01
 """Coverage of the campaign's runs above COVERAGE where offsets differ from day to day, not tracked and tracked: days of
 other motions are covered by as much less. Chosen on runs that no figure is reported on."""
+QUIET: Final = 0.85
+"""Coverage, at least, of the half of the samples that is widened less: elsewhere what widens sigma covers nearly all."""
 HALF_KNOWN: Final = 0.5
 LATEST: Final = 2.0
 """Largest `early`."""
@@ -517,7 +552,7 @@ def calibrated(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> 
     Without section `fused.zeros` new configurations track offsets with the scale of sigma, which is then that of tracked
     ones.
     """
-    offsets, doubt_nm = sensor_offsets(runs, fused.sigma.reference_nm)
+    offsets, doubt_nm = sensor_offsets([run.in_motion for run in runs], fused.sigma.reference_nm)
 
     def errors_of(section: Fused, *, track_zeros: bool) -> list[FusedErrors]:
         return [fused_errors(run, section, rated_nm, track_zeros=track_zeros) for run in runs]
@@ -526,8 +561,16 @@ def calibrated(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> 
         return _beyond(errors, offsets, doubt_nm, fused.tracking)
 
     def scale(errors: Sequence[FusedErrors], coverage: float) -> Scale:
-        spreads, quadrants = [run.spread_nm for run in errors], [run.quadrant for run in errors]
-        return conformal_scale(beyond(errors), spreads, quadrants, coverage)
+        rest, widened = beyond(errors), [run.more_nm2 / run.spread_nm**2 for run in errors]
+        scales = []
+        for most, share in ((np.inf, coverage), (np.median(np.concatenate(widened)), QUIET)):
+            keep = [more <= most for more in widened]
+            kept = [x[k] for x, k in zip(rest, keep, strict=True)]
+            spreads = [run.spread_nm[k] for run, k in zip(errors, keep, strict=True)]
+            quadrants = [run.quadrant[k] for run, k in zip(errors, keep, strict=True)]
+            scales.append(conformal_scale(kept, spreads, quadrants, share))
+        a, b, c, d = map(max, *scales)
+        return a, b, c, d
 
     if fused.zeros is None:
         errors = errors_of(fused, track_zeros=True)

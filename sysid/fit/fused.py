@@ -79,6 +79,7 @@ from jtqd.sysid.fit.calibration import (
     fit_tracking,
     fused_errors,
     low_pass_advance,
+    observed_run,
     path_residuals,
     standing_errors,
 )
@@ -436,7 +437,8 @@ def fit_fused(runs: Sequence[RunSignals], joint: Joint, *, two_encoders: bool = 
             f"found {counted(len(runs), 'run')}, expected at least {_LEAST_RUNS}: standard deviations need held-out runs"
         )
     rated_nm = joint.rated_torque_nm
-    moving, standing = _held_out(runs, joint.friction, two_encoders=two_encoders)
+    observed, standing = _held_out(runs, joint.friction, two_encoders=two_encoders)
+    moving = [run.in_motion for run in observed]
     fit = fit_loss(runs, joint.friction)
     fused = Fused(fit.loss, None, fit_sigma(moving, with_torsion=two_encoders))
     if two_encoders:
@@ -451,20 +453,20 @@ def fit_fused(runs: Sequence[RunSignals], joint: Joint, *, two_encoders: bool = 
             standstill=fit_standstill(at_rest, fused.sigma.reference_nm),
         )
         if fused.tracking is not None:
-            moving = [run.with_tracked_torsion() for run in moving]
+            moving, observed = ([run.with_tracked_torsion() for run in part] for part in (moving, observed))
         fused = replace(fused, zeros=fit_zeros(moving, fused, rated_nm))
         fused = replace(fused, agreement=fit_agreement(moving, fused, rated_nm))
-    return FusedFit(calibrated(moving, fused, rated_nm), fit, rmse)
+    return FusedFit(calibrated(observed, fused, rated_nm), fit, rmse)
 
 
 def _held_out(
     runs: Sequence[RunSignals], friction: Friction, *, two_encoders: bool
 ) -> tuple[list[PathResiduals], list[tuple[PathResiduals, FloatArray]]]:
-    """Return the residuals of every run with motion, in order, from fits on the other folds: moving; at rest.
+    """Return the residuals of every run with motion, in order, from fits on the other folds: all samples; at rest.
 
-    At rest only with two encoders, each with the `low_pass_advance` of its samples.
+    With one encoder those in motion alone. At rest: each with the `low_pass_advance` of its samples.
     """
-    moving: dict[int, PathResiduals] = {}
+    observed: dict[int, PathResiduals] = {}
     standing: dict[int, tuple[PathResiduals, FloatArray]] = {}
     for known, held_out in folds(runs):
         torsion = fit_torsion(known) if two_encoders else None
@@ -473,8 +475,10 @@ def _held_out(
             run = runs[n]
             if not run.moving.any():
                 continue
-            moving[n] = path_residuals(run, loss, torsion)
-            if torsion is not None:
+            if torsion is None:
+                observed[n] = path_residuals(run, loss, None)
+            else:
+                observed[n] = observed_run(run, loss, torsion)
                 advance = low_pass_advance(run, torsion)[run.standing]
                 standing[n] = (path_residuals(run, loss, torsion, run.standing), advance)
-    return [moving[n] for n in sorted(moving)], [standing[n] for n in sorted(standing)]
+    return [observed[n] for n in sorted(observed)], [standing[n] for n in sorted(standing)]

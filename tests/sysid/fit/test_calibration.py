@@ -17,6 +17,7 @@ from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL
+from jtqd.sysid.fit import calibration
 from jtqd.sysid.fit.calibration import (
     COVERAGE,
     FEWEST_RUNS,
@@ -505,6 +506,22 @@ def test_the_interval_holds_what_the_teacher_does_not_know(tracked: bool) -> Non
             error = (one.undelayed_nm if tracked else one.error_nm) - off
             shares.append(inside(one, error, found.sigma.scale, 0.3**2 if tracked else 0.0))
     assert np.mean(shares) == pytest.approx(COVERAGE, abs=0.06)
+
+
+def test_where_sigma_is_widened_hides_no_error_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the samples are held by what widens sigma: 80 % of the others would do for 90 % of all, 85 % are asked for."""
+    rng, n = np.random.default_rng(16), 4000
+    one, none = np.ones(n), np.zeros(n)
+
+    def errors(_: PathResiduals, *__: object, **___: object) -> FusedErrors:
+        more = np.where(np.arange(n) % 2 == 0, 100.0, 0.0)
+        return FusedErrors(rng.normal(size=n), none, one, more, one, np.zeros(n, np.intp), none)
+
+    monkeypatch.setattr(calibration, "fused_errors", errors)
+    section = replace(fused(), agreement=None, zeros=None)
+    section = replace(section, sigma=replace(section.sigma, reference_nm=0.0))
+    found = calibrated(runs_of_sensor(np.zeros(20)), section, RATED)
+    assert found.sigma.scale[0] == pytest.approx(1.4395 / GAUSS, rel=0.02)
 
 
 def of_day(known: float, error_nm: float, rng: np.random.Generator) -> tuple[FusedErrors, np.ndarray]:
