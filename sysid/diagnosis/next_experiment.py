@@ -55,17 +55,14 @@ PLAN_FILE: Final = "next_experiment.plan.yaml"
 MOTION_FILE: Final = "next_experiment.motion.csv"
 _RANGE: Final = ("travel_rad", "velocity_rad_s", "acceleration_rad_s2")
 """Limits that the motion of a joint without runs needs."""
-_INSIDE: Final = 0.05
-"""Part of the travel that is left free at either end."""
-_TORQUE_SHARE: Final = 0.9
-"""Of the allowed torque: positions that needed more in the runs are not visited."""
+_MARGIN: Final = 0.1
+"""Part of the travel and of the allowed torque that is left free."""
 _BINS: Final = 24
 """Of the travel, in each of which the largest torque is known."""
 _LEAST_TRAVEL_RAD: Final = 0.02
 """A joint that moved less stood."""
-_ACCELERATION_QUANTILE: Final = 0.99
 _ACCELERATION_S: Final = 0.1
-"""The acceleration of a run: this quantile of means over this time."""
+"""The acceleration of a run is the largest of its means over this time."""
 _TOWING: Final = (
     "On a towing bench diagnose both joints together: the plan is then a campaign, and a sensor fault is in the "
     "balances of both joints, a joint fault in one."
@@ -215,14 +212,14 @@ def joint_range_of(joint: Joint, signals: Sequence[JointSignals]) -> JointRange:
     low = max(limits.travel_rad[0], float(np.min(position)))
     high = min(limits.travel_rad[1], float(np.max(position)))
     moved = high - low >= _LEAST_TRAVEL_RAD and speed >= SLOWEST_RAD_S and acceleration > 0.0
-    stretch = _calm_stretch(position, torque, low, high, _TORQUE_SHARE * allowed) if moved else None
+    stretch = _calm_stretch(position, torque, low, high, (1.0 - _MARGIN) * allowed) if moved else None
     if stretch is None:
         raise NoRangeError(
             "within motion_limits of the joint file (or --limits) the joint stood in these runs, or it needed more than "
-            f"{_TORQUE_SHARE:.0%} of the torque allowed"
+            f"{1.0 - _MARGIN:.0%} of the torque allowed"
         )
     low, high = stretch
-    margin = _INSIDE * (high - low)
+    margin = 0.5 * _MARGIN * (high - low)
     needed = float(np.max(torque[(position >= low) & (position <= high)]))
     return JointRange(low + margin, high - margin, speed, acceleration, allowed, needed)
 
@@ -232,7 +229,7 @@ def _acceleration(s: JointSignals) -> float:
     v = s.state.velocity_rad_s
     wide = min(max(1, round(_ACCELERATION_S / s.step_s)), len(v) - 1)
     calm = below(v, s.step_s, 1.0 / _ACCELERATION_S)
-    return float(np.quantile(np.abs(calm[wide:] - calm[:-wide]), _ACCELERATION_QUANTILE)) / (wide * s.step_s)
+    return float(np.max(np.abs(calm[wide:] - calm[:-wide]))) / (wide * s.step_s)
 
 
 def _calm_stretch(

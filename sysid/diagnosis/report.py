@@ -281,9 +281,11 @@ def _priors_behind(causes: Sequence[Cause], findings: Findings) -> str:
 
 
 def _next(why: str) -> str:
-    """Return the kinds of motion that an experiment has, and the first sentence of its reason."""
+    """Return the kinds of motion that an experiment has, and the first of its reasons."""
     kinds = [kind.replace("_", " ") for kind in EXPERIMENTS if f"{kind}: " in why]
-    first = in_words(why.partition(". ")[0].rstrip("."))
+    reason, _, more = why.partition(". ")[0].rstrip(".").partition("; ")
+    others = f", and {1 + more.count('; ')} more" if more else ""
+    first = f"{in_words(reason)}{others}"
     return f"{listed(kinds)}, because {first}" if kinds else first
 
 

@@ -173,7 +173,7 @@ def _views(balance: Balance, parts: Sequence[FloatArray], before: Sequence[View]
 def axis_edges(axis: str, values: FloatArray) -> FloatArray | None:
     """Return the edges of the bins of an axis, None where it does not vary."""
     good = values[np.isfinite(values)]
-    if len(good) < 100:
+    if not len(good):
         return None
     if axis == "motor_angle":
         return np.linspace(0.0, 2.0 * np.pi, BINS + 1)
