@@ -38,6 +38,8 @@ exit status: 0 the files are there, 1 no proposal can be made, 2 usage"""
 def main(argv: list[str]) -> int:
     """Look at the tables, write the files, print what is open; returns the exit status."""
     options = parser().parse_args(argv)
+    if not options.from_csv:  # argparse would refuse `--from-csv --help` before it sees --help
+        parser().error("--from-csv: found no file, expected one or more")
     try:
         paths = run_paths(options.from_csv)
         wrong = next((path for path in paths if not ends_in(path, TABLES)), None)
@@ -74,10 +76,8 @@ def parser() -> argparse.ArgumentParser:
         _EXAMPLES,
     )
     tables = "tables of one rig (.csv, .csv.gz, .parquet) or directories of them"
-    made.add_argument("--from-csv", type=Path, nargs="+", required=True, metavar="FILE", help=tables)
-    made.add_argument(
-        "--out", type=Path, default=Path(), metavar="DIR", help="directory for the files (default .)"
-    )
+    made.add_argument("--from-csv", type=Path, nargs="*", required=True, metavar="FILE", help=tables)
+    made.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="directory of the files (.)")
     made.add_argument("--force", action="store_true", help="replace files that are there")
     return made
 
@@ -128,13 +128,9 @@ def map_lines(joint: JointProposal) -> list[str]:
         motor = targets.get("motor_position_rad")
         if motor is not None and "link_position_rad" not in targets:
             angle = quoted(motor.column) if motor.text == motor.column else motor.text
-            lines.append(
-                line("link_position_rad", _text(f"{angle} / {OPEN}"), f"{per_turn}; then gear_ratio")
-            )
+            lines.append(line("link_position_rad", _text(f"{angle} / {OPEN}"), f"{per_turn}, gear_ratio"))
         load = f"{{mass_kg: {OPEN}, lever_m: {OPEN}}}"
-        lines.append(
-            line("load", load, "no torque sensor: a known weight, or {inertia_kgm2: 0} with nothing mounted")
-        )
+        lines.append(line("load", load, "no torque sensor: a known weight, or {inertia_kgm2: 0} for none"))
     return lines
 
 
@@ -191,9 +187,7 @@ def report(proposal: Proposal, texts: Mapping[str, str], arguments: Sequence[Pat
         missing = table_lines([(f"  {key}", what) for key, what in keys], (0, 1))
         lines += ["", f"fill in {', '.join(paths)}:", *missing]
     numbers = [f"{each.number}=" if len(files) > 1 else "" for each in proposal.joints]
-    joints = [
-        f"--joint {number}{shlex.quote(str(path))}" for number, path in zip(numbers, files, strict=True)
-    ]
+    joints = [f"--joint {n}{shlex.quote(str(path))}" for n, path in zip(numbers, files, strict=True)]
     runs = " ".join(shlex.quote(str(each)) for each in arguments)
     columns, results = shlex.quote(str(out / COLUMNS)), shlex.quote(str(out / "diagnosis"))
     command = f"jtq diagnose {runs} --columns {columns} {' '.join(joints)} --out {results}"

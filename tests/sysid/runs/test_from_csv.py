@@ -219,6 +219,17 @@ def test_every_column_that_is_not_used_has_a_reason(tmp_path, capsys):
     assert [row.split()[0] for row in spared] == ["U", "Duty"]
 
 
+def test_help_needs_no_file(capsys):
+    with pytest.raises(SystemExit) as ended:
+        init("--help")
+    assert ended.value.code == 0
+    assert "--out DIR" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as ended:
+        init("--out", "x")
+    assert ended.value.code == 2
+    assert "expected one or more" in capsys.readouterr().err
+
+
 def test_files_that_are_there_stay_without_force(tmp_path, capsys):
     table = written(tmp_path / "a.csv", recording(4))
     (tmp_path / "joint.yaml").write_text("mine")
