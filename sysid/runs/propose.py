@@ -23,27 +23,8 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.runs.column_names import (
-    ANGLE,
-    COMMAND,
-    COUNTS,
-    CURRENT,
-    DUTY,
-    ENABLED,
-    LINK,
-    MOTOR,
-    SENSOR,
-    SPEED,
-    SUPPLY,
-    TEMPERATURE,
-    TIME,
-    TORQUE,
-    UNITS,
-    VOLTAGE,
-    Name,
-    quoted,
-    read_name,
-)
+from jtqd.sysid.runs import column_names as of
+from jtqd.sysid.runs.column_names import COUNTS, Name, quoted, read_name
 
 Table = Mapping[str, FloatArray]
 """Columns [n] of one file by name; NaN: a blank cell."""
@@ -55,13 +36,15 @@ DRIVE: Final = "drive"
 _TURN: Final = 2.0 * math.pi
 _FITS: Final = 0.03
 """Relative: a factor between two columns is that of a unit."""
+_ROUND: Final = 0.005
+"""Relative: counts per turn are those of a usual encoder."""
 _ALIKE: Final = 0.98
 """Correlation of a velocity with a position's derivative."""
 _SAME: Final = 0.9995
 """Correlation from which on a torque is the current times a constant."""
 _LINK_TURNS: Final = 2.5
 """A joint turns less, a motor behind a gear more."""
-_SI: Final = {CURRENT: "A", TORQUE: "Nm", VOLTAGE: "V", TEMPERATURE: "degC"}
+_SI: Final = {of.CURRENT: "A", of.TORQUE: "Nm", of.VOLTAGE: "V", of.TEMPERATURE: "degC"}
 _LARGEST_RAD: Final = 8.0 * math.pi
 _LARGEST_A: Final = 200.0
 """Joint angles beyond are degrees, currents beyond are mA."""
@@ -71,10 +54,15 @@ _BLOCK_S: Final = 0.05
 _FEWEST_BLOCKS: Final = 20
 _RATE_HZ: Final = (5.0, 20_000.0)
 _CALLS: Final = {
-    **{"deg": "deg2rad", "deg/s": "deg2rad", "rev": "rev2rad", "rev/s": "rev2rad", "rpm": "rpm2rad_s"}
+    "deg": "deg2rad",
+    "deg/s": "deg2rad",
+    "rev": "rev2rad",
+    "rev/s": "rev2rad",
+    "rpm": "rpm2rad_s",
 }
-_ANGLES: Final = {unit: factor for kind, unit, factor in UNITS.values() if kind == ANGLE and unit != COUNTS}
-_SPEEDS: Final = {unit: factor for kind, unit, factor in UNITS.values() if kind == SPEED}
+_BY_SIZE: Final = [unit[:3] for unit in of.UNITS if not unit[1].startswith(("mrad", COUNTS))]
+_ANGLES: Final = {unit: factor for kind, unit, factor in _BY_SIZE if kind == of.ANGLE}
+_SPEEDS: Final = {unit: factor for kind, unit, factor in _BY_SIZE if kind == of.SPEED}
 
 
 @dataclass
@@ -108,6 +96,11 @@ class Guess:
     def finite(self) -> FloatArray:
         """Values without blank cells [n]."""
         return self.values[np.isfinite(self.values)]
+
+    @property
+    def whole(self) -> bool:
+        """Whether all values are whole numbers."""
+        return bool(np.all(self.finite == np.round(self.finite)))
 
     @property
     def unrolled(self) -> FloatArray:
@@ -181,17 +174,15 @@ def propose(tables: Sequence[Table]) -> Proposal:
         guesses.append(Guess(name, values, name.kind, name.unit, name.factor))
     time, seconds = _time(guesses)
     for each in guesses:
-        if each.used and each.kind != TIME and (why := _unusable(each)):
+        if each.used and each.kind != of.TIME and (why := _unusable(each)):
             each.drop(why)
-    columns = [each for each in guesses if each.used and each.kind != TIME]
+    columns = [each for each in guesses if each.used and each.kind != of.TIME]
     _set_joints(columns)
     numbers = sorted({each.joint for each in columns if each.used})
     if not numbers:
         expected = "expected words such as current, position, torque"
         raise ProposalError(f"found no column that its name makes one of a joint, {expected}")
-    joints = [
-        _Joint(n, [each for each in columns if each.used and each.joint == n], seconds) for n in numbers
-    ]
+    joints = [_Joint(n, [x for x in columns if x.used and x.joint == n], seconds) for n in numbers]
     proposals = tuple(each.proposal() for each in joints)
     _check_together([each for each in columns if each.target])
     steps = np.diff(seconds[np.isfinite(seconds)])
@@ -206,16 +197,16 @@ def _rises(x: FloatArray) -> bool:
 
 def _time(guesses: Sequence[Guess]) -> tuple[str, FloatArray]:
     """Return the expression of the time and its values [n, s]; other columns of a time are dropped. Raises ProposalError."""
-    named = [each for each in guesses if each.kind == TIME and not COMMAND & each.name.words]
+    named = [each for each in guesses if each.kind == of.TIME and not of.COMMAND & each.name.words]
     parts = [x for x in named if x.unit == "ns" and np.nanmin(x.values) >= 0.0 and np.nanmax(x.values) < 1e9]
-    whole = [
-        x for x in named if x.unit in ("s", "") and x not in parts and np.all(x.finite == np.round(x.finite))
-    ]
+    whole = [x for x in named if x.unit in ("s", "") and x not in parts and x.whole]
     rising = [each for each in named if _rises(each.values) and each not in parts]
+    rising.sort(key=lambda each: bool((of.MOTOR | of.LINK | of.SENSOR) - {"ts"} & each.name.words))
     time = next(iter(rising or [each for each in guesses if not each.kind and _rises(each.values)]), None)
     if parts and whole:
         for each in named:
-            each.drop("a second time")
+            if not _no_time(each, whole[0]):
+                each.drop("a second time")
         for each, why in ((whole[0], "whole seconds of the stamp"), (parts[0], "its part below a second")):
             each.target, each.unit, each.why = "time_s", each.unit or "s", [why]
         text = f"{quoted(whole[0].column)} + 1e-9 * {quoted(parts[0].column)}"
@@ -223,37 +214,52 @@ def _time(guesses: Sequence[Guess]) -> tuple[str, FloatArray]:
     if time is None:
         raise ProposalError("found no column that rises from row to row, expected a time in s, ms, us or ns")
     for each in named:
-        if each is not time:
+        if each is not time and not _no_time(each, time):
             each.drop("a second time")
     steps = np.diff(time.finite)
     step = float(np.median(steps[steps > 0.0]))
-    units = [(unit, factor) for kind, unit, factor in dict.fromkeys(UNITS.values()) if kind == TIME]
+    units = [(unit, factor) for kind, unit, factor, _ in of.UNITS if kind == of.TIME]
     fitting = [each for each in units if _RATE_HZ[0] <= 1.0 / (step * each[1]) <= _RATE_HZ[1]]
     if not time.known and not fitting:
-        raise ProposalError(
-            f"column {time.column!r}: found steps of {step:.3g}, expected a time in s, ms, us or ns"
-        )
+        found = f"column {time.column!r}: found steps of {step:.3g}"
+        raise ProposalError(f"{found}, expected a time in s, ms, us or ns")
     if time.known and (not fitting or (time.unit, time.factor) in fitting):
         time.take(time.unit, time.factor, "unit by its name")
     else:
         time.take(*fitting[0], f"unit by its step of {step:.3g}")
-    time.kind, time.target = TIME, "time_s"
+    time.kind, time.target = of.TIME, "time_s"
     return time.text, time.factor * time.values
+
+
+def _no_time(guess: Guess, time: Guess) -> bool:
+    """Return whether a column that may be of another quantity by its name is no time, and set its quantity."""
+    rows = np.diff(time.values) > 0.0
+    rate = float(np.nanmedian(np.diff(guess.values)[rows] / np.diff(time.values)[rows]))
+    if not guess.name.others or (rate > 0.0 and _near(rate, [10.0 ** (3 * k) for k in range(-3, 4)])):
+        return False
+    both = of.TEMPERATURE not in guess.name.others or float(np.nanmin(guess.values)) < 0.0
+    guess.kind = of.TORQUE if both else of.TEMPERATURE
+    guess.why.append(f"by its name a time too, which it is not{'' if both else '; never negative'}")
+    return True
+
+
+def _near(x: float, values: Sequence[float], part: float = _FITS) -> bool:
+    return min(abs(x / each - 1.0) for each in values) < part
 
 
 def _unusable(guess: Guess) -> str:
     """Return why a column is not used by what its name or its values alone show; "": it may be."""
     x, words = guess.finite, guess.name.words
     reasons = (
-        (not guess.kind, "no quantity of a joint by its name"),
-        (bool(COMMAND & words), "a command, not a measurement"),
+        (not guess.kind, f"no quantity of a joint by its name{guess.unit and f' and unit {guess.unit}'}"),
+        (bool(of.COMMAND & words), "a command, not a measurement"),
         (len(x) < 2, "no finite numbers"),
         (
-            guess.kind in (VOLTAGE, TEMPERATURE, CURRENT) and SUPPLY & words,
-            "of supply or electronics, not of the motor",
+            guess.kind in _SI and guess.kind != of.TORQUE and of.SUPPLY & words,
+            "of the supply, not of the motor",
         ),
         (
-            guess.kind != ENABLED and len(x) and np.ptp(x) == 0.0,
+            guess.kind != of.ENABLED and len(x) and np.ptp(x) == 0.0,
             f"{x[:1].sum():g} in every row: shows nothing",
         ),
     )
@@ -303,9 +309,9 @@ class _Joint:
         self.ratio: float | None = None
 
     def proposal(self) -> JointProposal:
-        positions, speeds = self._of(ANGLE), self._of(SPEED)
+        positions, speeds = self._of(of.ANGLE), self._of(of.SPEED)
         for each in (*positions, *speeds):
-            each.side = "motor" if MOTOR & each.name.words else "link" if LINK & each.name.words else ""
+            each.side = "motor" if of.MOTOR & each.name.words else "link" if of.LINK & each.name.words else ""
             if each.known:
                 each.why.append("unit by its name")
         for each in positions:
@@ -313,14 +319,15 @@ class _Joint:
         self._units(positions, speeds)
         positions = self._sides(positions)
         speeds = self._sides_of_speeds(positions, speeds)
-        current = self._one(CURRENT, "current_a", frozenset({"iq", "motor", "q", "actual"}))
-        drive = current or self._one(VOLTAGE, DRIVE, frozenset({"uq", "motor"})) or self._one(DUTY, DRIVE)
-        for each in (*self._of(VOLTAGE), *self._of(DUTY)):
+        current = self._one(of.CURRENT, "current_a", frozenset({"iq", "motor", "q", "actual"}))
+        voltage = None if current else self._one(of.VOLTAGE, DRIVE, frozenset({"uq", "motor"}))
+        drive = current or voltage or self._one(of.DUTY, DRIVE)
+        for each in (*self._of(of.VOLTAGE), *self._of(of.DUTY)):
             if drive is not None and each is not drive:
                 each.drop(f"not needed besides {drive.column!r}")
         torque = self._torque(current, drive)
-        self._one(TEMPERATURE, "temperature_c", frozenset({"motor", "winding", "coil"}))
-        self._one(ENABLED, "enabled")
+        self._one(of.TEMPERATURE, "temperature_c", frozenset({"motor", "winding", "coil"}))
+        self._one(of.ENABLED, "enabled")
         if drive is not None:
             self._sign(drive, torque, [*positions, *speeds])
         columns = tuple(each for each in self.guesses if each.target)
@@ -332,7 +339,7 @@ class _Joint:
     def _moves(self, guess: Guess) -> FloatArray:
         """Return how far a position, or the integral of a velocity, moves in each block [n], in its own unit."""
         x = guess.values
-        if guess.kind == SPEED:
+        if guess.kind == of.SPEED:
             return self._blocks(0.5 * (x[1:] + x[:-1]) * self.step)
         return self._blocks(np.diff(guess.unrolled) + 0.0 * self.step)
 
@@ -353,17 +360,9 @@ class _Joint:
     def _units(self, positions: Sequence[Guess], speeds: Sequence[Guess]) -> None:
         """Give units to positions and velocities that have none by name: by each other, else by size."""
         for each in positions:
-            if (
-                not each.unit
-                and np.all(each.finite == np.round(each.finite))
-                and len(np.unique(each.finite)) > 20
-            ):
+            if not each.unit and each.whole and len(np.unique(each.finite)) > 20:
                 each.unit = COUNTS
-        for position in positions:
-            for speed in speeds:
-                ratio = abs(self._factor(position, speed))
-                if math.isfinite(ratio) and {position.side, speed.side} != {"motor", "link"}:
-                    _units_by_ratio(position, speed, ratio)
+        self._units_by_derivative(positions, speeds)
         bare = [each for each in positions if not each.unit]
         sizes = [float(np.max(np.abs(each.finite))) for each in bare if each.side != "motor"]
         # of two positions without a unit the slower one shows it
@@ -371,10 +370,19 @@ class _Joint:
         for each in bare:
             unit, by = ("deg", "by its size") if large else ("rad", "taken as rad")
             each.take(unit, _ANGLES[unit], f"no unit in its name: {by}")
+        self._units_by_derivative(positions, speeds)
         for each in speeds:
             if not each.known:
-                unit = "deg/s" if any(position.unit == "deg" for position in positions) else "rad/s"
+                deg = any(p.unit == "deg" and math.isnan(self._factor(p, each)) for p in positions)
+                unit = "deg/s" if deg else "rad/s"  # in its own unit it is not the derivative of any
                 each.take(unit, _SPEEDS[unit], f"no unit in its name: taken as {unit}")
+
+    def _units_by_derivative(self, positions: Sequence[Guess], speeds: Sequence[Guess]) -> None:
+        for position in positions:
+            for speed in speeds:
+                ratio = abs(self._factor(position, speed))
+                if math.isfinite(ratio) and {position.side, speed.side} != {"motor", "link"}:
+                    _units_by_ratio(position, speed, ratio)
 
     def _sides(self, positions: Sequence[Guess]) -> list[Guess]:
         """Return the position of the motor and that of the link, and set the gear ratio that they show."""
@@ -400,9 +408,8 @@ class _Joint:
                 link.why.append("turns against the motor: sign turned")
             ratio = abs(ratio * motor.factor / link.factor)
             if math.isfinite(ratio):
-                self.ratio = (
-                    float(round(ratio)) if abs(ratio / round(ratio) - 1.0) < 0.003 else round(ratio, 3)
-                )
+                whole = abs(ratio / round(ratio) - 1.0) < 0.003
+                self.ratio = float(round(ratio)) if whole else round(ratio, 3)
         for each in kept:
             steps = np.diff(np.unique(each.finite))
             least = float(np.mean(steps[steps < 1.5 * steps.min()]))
@@ -448,7 +455,7 @@ class _Joint:
         chosen.target = target
         if chosen.known:
             chosen.why.append("by its name")
-        elif kind == CURRENT and float(np.max(np.abs(chosen.finite))) > _LARGEST_A:
+        elif kind == of.CURRENT and float(np.max(np.abs(chosen.finite))) > _LARGEST_A:
             chosen.take("mA", 1e-3, "no unit in its name: by its size")
         else:
             unit = _SI.get(kind, "")
@@ -457,19 +464,16 @@ class _Joint:
 
     def _torque(self, current: Guess | None, drive: Guess | None) -> Guess | None:
         """Return the torque that is a reference: a sensor's, along the current. What a drive computes of it is none."""
-        for each in self._of(TORQUE):
-            if SENSOR & each.name.words:
+        for each in self._of(of.TORQUE):
+            if of.SENSOR & each.name.words:
                 continue
             if current is not None and abs(_alike(current, each)) > _SAME:
                 each.drop(f"{current.column!r} times a constant: the drive's own torque, no reference")
             elif drive is None:
-                each.take(
-                    each.unit or "Nm",
-                    each.factor if each.known else 1.0,
-                    "no current: taken as the drive's own",
-                )
+                factor = each.factor if each.known else 1.0
+                each.take(each.unit or "Nm", factor, "no current: taken as the drive's own")
                 each.target, each.used = DRIVE, False
-        torque = self._one(TORQUE, "torque_nm", SENSOR)
+        torque = self._one(of.TORQUE, "torque_nm", of.SENSOR)
         if torque is not None and current is not None and (alike := _alike(current, torque)) < _AGAINST:
             torque.sign = -1.0
             torque.why.append(f"against the current (correlation {alike:.2f}): sign turned")
@@ -499,7 +503,7 @@ def _roll_over(guess: Guess) -> None:
     """Find the period of a position that rolls over; that of counts is a turn of the encoder."""
     x = guess.finite
     span = float(np.ptp(x))
-    whole = bool(np.all(x == np.round(x))) and span > 50.0
+    whole = guess.whole and span > 50.0
     power = 2.0 ** math.ceil(math.log2(max(span, 1.0)))
     periods = {"deg": (360.0,), "rad": (_TURN,), "rev": (1.0,), COUNTS: (power, span + 1.0)}
     for period in periods.get(guess.unit, (power,) if whole else (_TURN, 360.0)):
@@ -516,13 +520,17 @@ def _units_by_ratio(position: Guess, speed: Guess, ratio: float) -> None:
     """Give the units that d(position)/dt = ratio * speed, in own units, shows; those that a name states stay."""
     if position.known and speed.known:
         return
-    if position.unit == COUNTS:
-        if speed.known:
-            factor = speed.factor / ratio
-            position.take(COUNTS, factor, f"{_TURN / factor:.6g} counts per turn by {speed.column!r}")
+    rates = {speed.unit: speed.factor} if speed.known else _SPEEDS
+    if position.unit == COUNTS and not position.known:
+        turns = {rate: _TURN * ratio / factor for rate, factor in rates.items()}
+        found = [rate for rate, per_turn in turns.items() if speed.known or _is_round(per_turn)]
+        for rate in found if len(found) == 1 else ():
+            why = f"{turns[rate]:.6g} counts per turn by {speed.column!r}"
+            position.take(COUNTS, _TURN / turns[rate], why)
+            if not speed.known:
+                speed.take(rate, rates[rate], f"with it {position.column!r} has a usual resolution")
         return
     angles = {position.unit: position.factor} if position.known else _ANGLES
-    rates = {speed.unit: speed.factor} if speed.known else _SPEEDS
     fitting = [(a, r) for a in angles for r in rates if abs(ratio * angles[a] / rates[r] - 1.0) < _FITS]
     if len(fitting) != 1 and not (position.known or speed.known):
         return  # rad with rad/s look like deg with deg/s
@@ -531,6 +539,12 @@ def _units_by_ratio(position: Guess, speed: Guess, ratio: float) -> None:
             position.take(angle, angles[angle], f"unit by {speed.column!r}, its derivative")
         if not speed.known:
             speed.take(rate, rates[rate], f"unit by the derivative of {position.column!r}")
+
+
+def _is_round(per_turn: float) -> bool:
+    """Return whether encoders have so many counts per turn: powers of two; 1, 2, 4, 5 times a power of ten."""
+    usual = [2.0**k for k in range(7, 25)] + [m * 10.0**k for m in (1, 2, 4, 5) for k in range(2, 7)]
+    return _near(per_turn, usual, _ROUND)
 
 
 def _alike(one: Guess, two: Guess) -> float:

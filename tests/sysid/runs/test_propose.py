@@ -55,6 +55,32 @@ def proposed(**columns):
         ("position_s", "position", "", None),
         ("acceleration", "", "", None),
         ("status", "", "", None),
+        *(
+            (name, "current", "mA", None)
+            for name in ("i_mA", "I_mA", "iq_mA", "current_mA", "IqMA", "effort [mA]")
+        ),
+        ("iq_mA_2", "current", "mA", 2),
+        ("i_m_A", "current", "A", None),
+        ("torque_mNm", "torque", "mNm", None),
+        ("torque_m_Nm", "torque", "Nm", None),
+        ("Ts_Nm", "torque", "Nm", None),
+        ("T_Nm", "torque", "Nm", None),
+        ("M [N·m] out", "torque", "Nm", None),
+        ("T_C", "temperature", "degC", None),
+        ("T_ms", "time", "ms", None),
+        ("degC", "temperature", "degC", None),
+        ("Temp [deg]", "temperature", "degC", None),
+        ("pos1_deg", "position", "deg", 1),
+        ("motor_rad_s", "velocity", "rad/s", None),
+        ("velRadPerSec", "velocity", "rad/s", None),
+        ("enc [rad/s]", "velocity", "rad/s", None),
+        ("rpm_motor", "velocity", "rpm", None),
+        ("dtheta_m", "velocity", "", None),
+        ("thetadot", "velocity", "", None),
+        ("phi_ddot", "", "", None),
+        ("acc_rad_s2", "", "rad/s2", None),
+        ("Torque [counts]", "", "counts", None),
+        ("loadcell_mV", "", "mV", None),
     ],
 )
 def test_a_name_states_quantity_unit_and_joint(name, kind, unit, number):
@@ -114,6 +140,50 @@ def test_the_time_and_its_unit(columns, expected):
 def test_units_and_sides_of_the_motion(columns, expected):
     found, _ = proposed(**columns, cur=CURRENT, sensor_torque=SENSOR)
     assert found == {**expected, "current_a": "cur", "torque_nm": "sensor_torque"}
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "target", "source"),
+    [
+        ("Ts_Nm", SENSOR, "torque_nm", "Ts_Nm"),
+        ("T_mNm", 1000.0 * SENSOR, "torque_nm", "0.001 * T_mNm"),
+        ("Ts", SENSOR, "torque_nm", "Ts"),
+        ("T", SENSOR, "torque_nm", "T"),
+        ("T_C", 31.0 + T / 60.0, "temperature_c", "T_C"),
+        ("T_motor", 31.0 + T / 60.0, "temperature_c", "T_motor"),
+        ("T_motor", np.round(31.0 + T / 60.0, 1), "temperature_c", "T_motor"),
+        ("ts", 1000.0 * T, "torque_nm", None),
+    ],
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_t_is_of_a_time_a_torque_or_a_temperature(name, values, target, source, first):
+    columns = {"t": T, "pos": Q, "i_mA": 1000.0 * CURRENT}
+    found = propose([{name: values, **columns} if first else {**columns, name: values}])
+    targets = {key: each.text for key, each in found.joints[0].targets.items()}
+    assert found.time in ("t", f"0.001 * {name}")
+    assert targets["current_a"] == "0.001 * i_mA"
+    assert targets.get(target) == source
+
+
+@pytest.mark.parametrize("unit", [1.0, DEG, 30.0 / math.pi])
+@pytest.mark.parametrize("turn", [4096, 10000])
+def test_a_velocity_is_compared_with_counts_and_not_with_another_position(unit, turn):
+    """By a roll-over the counts per turn are known; else only one unit of the velocity gives those of an encoder."""
+    counts = np.round(RATIO * Q * turn / (2.0 * math.pi))
+    for enc in (counts, counts % turn):
+        found, joint = proposed(enc_counts=enc, joint_deg=DEG * Q, vel=RATIO * unit * V)
+        assert joint.targets["motor_velocity_rad_s"].factor == pytest.approx(1.0 / unit)
+        assert 2.0 * math.pi / joint.targets["motor_position_rad"].factor == pytest.approx(turn, rel=0.003)
+        assert joint.gear_ratio == pytest.approx(RATIO, rel=0.003)
+        assert found["link_position_rad"] == "deg2rad(joint_deg)"
+
+
+def test_a_unit_that_contradicts_the_name_is_a_reason():
+    found = {each.column: each for each in propose([{"t": T, "pos": Q, "Tq [V]": SENSOR}]).columns}
+    assert (found["Tq [V]"].target, found["Tq [V]"].why) == (
+        "",
+        ["no quantity of a joint by its name and unit V"],
+    )
 
 
 def test_counts_per_turn_by_a_velocity():
