@@ -212,25 +212,16 @@ def _positions(c: Channels) -> Iterator[RunIssue]:
             turning = np.abs(by_velocity) > 0.2 * float(np.max(np.abs(by_velocity)))
             yield from _velocity_scale(c, float(np.median(by_position[turning] / by_velocity[turning])))
         elif float(np.ptp(motor)) > TURNED_RAD * gear:
-            text = (
-                f"found almost no motion while motor_position_rad turned by {float(np.ptp(motor)):.3g} rad, expected its "
-                "derivative: stuck, or of the joint side"
-            )
+            text = f"found almost none while the motor turned {float(np.ptp(motor)):.3g} rad: stuck, or of the joint side"
             yield c.issue("motor_velocity_rad_s", "scale", text)
     ratio = c.gear_ratio
     if ratio is None and link is not None and motor is not None:
         turned = float(np.ptp(motor)) / gear
         if turned > TURNED_RAD and float(np.ptp(link)) < 0.05 * turned:
-            text = (
-                f"found {float(np.ptp(link)):.3g} rad of motion while the motor turned the joint by {turned:.3g} rad: "
-                "stuck channel"
-            )
+            text = f"found {float(np.ptp(link)):.3g} rad while the motor turned the joint by {turned:.3g}: stuck channel"
             yield c.issue("link_position_rad", "stuck", text)
     elif ratio is not None and ratio < 0.0:
-        text = (
-            f"found it turning against motor_position_rad ({ratio:.5g} motor turns per turn), expected the same "
-            "direction: swapped sign"
-        )
+        text = f"found it turning against motor_position_rad ({ratio:.5g} motor turns per turn): swapped sign"
         yield c.issue("link_position_rad", "sign", text)
     # in a small swing the twist of the gear looks like another ratio
     swing = 0.0 if link is None else float(np.ptp(link))
@@ -238,11 +229,8 @@ def _positions(c: Channels) -> Iterator[RunIssue]:
     twist = TWIST_RAD + _SOFTER * min(loads, default=0.0) / c.joint.stiffness_nm_per_rad
     tolerance = max(RATIO_TOLERANCE, twist / swing if swing > 0.0 else math.inf)
     if ratio is not None and abs(abs(ratio) / gear - 1.0) > tolerance:
-        text = (
-            f"{c.where}: found {abs(ratio):.5g} motor turns per turn of the link, expected gear_ratio {gear:g} of "
-            f"{c.joint.name}: wrong gear ratio, or a position scaled wrongly"
-        )
-        yield RunIssue("gear_ratio", text)
+        text = f"found {abs(ratio):.5g} motor turns per link turn, {c.joint.name} has gear_ratio {gear:g}"
+        yield RunIssue("gear_ratio", f"{c.where}: {text}: wrong gear ratio, or a position scaled wrongly")
 
 
 def _velocity_scale(c: Channels, slope: float) -> Iterator[RunIssue]:
@@ -254,10 +242,7 @@ def _velocity_scale(c: Channels, slope: float) -> Iterator[RunIssue]:
         text = "found no motion while motor_velocity_rad_s is not zero: stuck channel"
         yield c.issue("motor_position_rad", "stuck", text)
     elif abs(slope - 1.0) > VELOCITY_TOLERANCE:
-        text = (
-            f"found {1.0 / slope:.4g} times the derivative of motor_position_rad, expected the same: a wrong scale, or one "
-            "of them stuck for a part of the run"
-        )
+        text = f"found {1.0 / slope:.4g} times the derivative of motor_position_rad: a wrong scale, or stuck in part"
         yield c.issue("motor_velocity_rad_s", "scale", text)
 
 
@@ -302,10 +287,7 @@ def _signs(c: Channels, speed: FloatArray, motor_nm: FloatArray, torque: FloatAr
         return
     lost_if_torque = float(integral(c.time_s, np.where(loaded, (motor_nm + torque) * speed, 0.0))[-1])
     swapped, other = ("torque_nm", "current_a") if lost_if_torque > 0.0 else ("current_a", "torque_nm")
-    text = (
-        f"found the opposite sign of {other} while the motor carries more than its friction, expected the same: swapped "
-        f"sign of {swapped} (with the other sign the joint loses energy)"
-    )
+    text = f"found the opposite sign of {other} under load (a gain of energy): swapped sign of {swapped}"
     yield c.issue(swapped, "sign", text)
 
 
@@ -319,11 +301,8 @@ def check_energy(c: Channels) -> Iterator[RunIssue]:
         return
     share = float(np.sum(((motor_nm - torque) * v)[moving]) / np.sum(friction[moving]))
     if share <= _ENERGY:
-        text = (
-            f"{c.where}: found {-share:.2g} times the friction power of {c.joint.name} gained instead of lost, expected a "
-            "loss: swapped sign of positions and velocities, or of current and torque_nm"
-        )
-        yield RunIssue("motion_sign", text)
+        text = f"found {-share:.2g} times the friction power of {c.joint.name} gained instead of lost: swapped sign"
+        yield RunIssue("motion_sign", f"{c.where}: {text} of the motion, or of current and torque_nm")
 
 
 def constant_channels(run: JointColumns, where: str) -> Iterator[RunIssue]:
@@ -420,11 +399,8 @@ def _exchange(
     best = min(errors, key=lambda what: errors[what])
     if own > least and errors[best] < LESS * own:
         what = f"j{a} and j{b}, {best}" if " " in best else f"j{a}.{best} and j{b}.{best}"
-        text = (
-            f"{what}: found the other joint's (the torque balances are off by {own:.3g} Nm rms, exchanged by "
-            f"{errors[best]:.3g} Nm), expected each joint's own: swapped columns"
-        )
-        return errors[best] / own, text
+        text = f"errors of {own:.3g} Nm rms, exchanged {errors[best]:.3g} Nm"
+        return errors[best] / own, f"{what}: found the other joint's ({text}): swapped columns"
     (one_a, one_b), (two_a, two_b) = ([_file_error(s, joints[n]) for n in (a, b)] for s in (one, two))
     better = max(one_b / max(one_a, 1e-30), two_a / max(two_b, 1e-30))
     if better < LESS and min(one_a, two_b) > MATTERS * min(joints[n].rated_torque_nm for n in (a, b)):
@@ -489,6 +465,7 @@ _OVER: Final = 3.0
 _ANY_RAD_S: Final = 1e3
 _OWN: Final = 1e-6
 """Part of a column that is its own, beyond rounding."""
+_LOAD: Final = "mass_kg in g or lever_m in mm of a known load, or a model's torque in another unit"
 _HOTTEST_C: Final = 150.0
 _STEP_K, _WARMING_K_PER_S = 2.0, 1.0  # between two samples: resolution, and more than any joint warms
 _TURN: Final = 1.0 / (2.0 * math.pi)
@@ -525,10 +502,8 @@ def temperature_issue(c: Channels) -> RunIssue | None:
     steps = np.abs(np.diff(temperature))
     jumps = np.flatnonzero(steps > _STEP_K + _WARMING_K_PER_S * np.diff(time_s))
     if len(jumps):
-        text = (
-            f"found a step of {steps[jumps[0]]:.3g} degC at {time_s[jumps[0] + 1]:.3f} s, expected none above {_STEP_K:g}; "
-            "not used"
-        )
+        step, at = steps[jumps[0]], time_s[jumps[0] + 1]
+        text = f"found a step of {step:.3g} degC at {at:.3f} s, expected none above {_STEP_K:g}; not used"
         return c.issue("temperature_c", "step", text)
     middle = float(np.median(temperature))
     if -60.0 < middle < _HOTTEST_C:
@@ -549,19 +524,14 @@ def _velocity(c: Channels) -> RunIssue | None:
     ratio = abs(float(np.median(by_velocity[turning] / by_position[turning])))
     if _near(ratio, 1.0) or ratio == 0.0:
         return None
+    at_speed, at_angle, at_time = ".motor_velocity_rad_s", ".motor_position_rad", ": time_s"
     suspects = [
-        *((ratio, factor, ".motor_velocity_rad_s", unit, "rad/s") for unit, factor in _SPEEDS.items()),
-        *((1.0 / ratio, factor, ".motor_position_rad", unit, "rad") for unit, factor in _ANGLES.items()),
-        (ratio, 1000.0, ": time_s", "milliseconds", "seconds"),
-        (ratio, 1e6, ": time_s", "microseconds", "seconds"),
-        (
-            ratio,
-            1.0 / c.joint.gear_ratio,
-            ".motor_velocity_rad_s",
-            "the joint side's velocity",
-            "the motor's",
-        ),
-        (ratio, 1.0 / 6.0, ".motor_velocity_rad_s", "rpm and degrees", "rad/s and rad"),
+        *((ratio, factor, at_speed, unit, "rad/s") for unit, factor in _SPEEDS.items()),
+        *((1.0 / ratio, factor, at_angle, unit, "rad") for unit, factor in _ANGLES.items()),
+        (ratio, 1000.0, at_time, "milliseconds", "seconds"),
+        (ratio, 1e6, at_time, "microseconds", "seconds"),
+        (ratio, 1.0 / c.joint.gear_ratio, at_speed, "the joint side's velocity", "the motor's"),
+        (ratio, 1.0 / 6.0, at_speed, "rpm and degrees", "rad/s and rad"),
     ]
     for found, factor, at, unit, expected in suspects:
         if _near(found, factor):
@@ -597,15 +567,9 @@ def _motor_speed(c: Channels) -> RunIssue | None:
     if top < _FASTEST_MOTOR_RAD_S:
         return None
     limits = c.joint.motion_limits
-    allowed = (
-        _FASTEST_RAD_S
-        if limits is None
-        else max(_FASTEST_RAD_S, _OVER * min(limits.velocity_rad_s, _ANY_RAD_S))
-    )
-    needed, had = (
-        _needed_nm(c),
-        max((_peak(x) for x in (c.motor_nm, c.run.torque_nm) if x is not None), default=math.inf),
-    )
+    allowed = max(_FASTEST_RAD_S, _OVER * min(limits.velocity_rad_s, _ANY_RAD_S) if limits else 0.0)
+    needed = _needed_nm(c)
+    had = max((_peak(x) for x in (c.motor_nm, c.run.torque_nm) if x is not None), default=math.inf)
     if top / gear < allowed and needed < _PEAK * had:
         return None
     position = c.run.link_position_rad if c.run.motor_position_rad is None else c.run.motor_position_rad
@@ -645,11 +609,9 @@ def _torque_and_current(c: Channels) -> RunIssue | None:
         if max(sizes.values()) < _PEAK:
             return None
         # both are too large alike: the joint file is common to them
-        text = (
-            f"{c.where}: found peaks of {sizes['torque_nm']:.3g} times rated_torque_nm ({rated:g} Nm) of {c.joint.name}, "
-            f"expected at most {_PEAK:g}: a joint file of another joint, or mNm and mA"
-        )
-        return RunIssue("joint_file", text)
+        text = f"found peaks of {sizes['torque_nm']:.3g} times rated_torque_nm ({rated:g}) of {c.joint.name}"
+        why = f"expected at most {_PEAK:g}: a joint file of another joint, or {_LOAD if c.known_load else 'mNm and mA'}"
+        return RunIssue("joint_file", f"{c.where}: {text}, {why}")
     size = abs(slope)
     if size > 1.0:
         channel, unit = "torque_nm", "mNm or counts"
@@ -666,11 +628,10 @@ def _torque_and_current(c: Channels) -> RunIssue | None:
         channel, unit = "torque_nm", "torque of the motor side (or kNm)"
     else:
         channel, unit = "torque_nm", "kNm or a signal in volts"
-    text = (
-        f"found {size:.3g} Nm at the sensor per Nm of the motor (G Kt i), friction aside, expected about 1: {unit} "
-        f"suspected, expected {'A' if channel == 'current_a' else 'Nm'}, or a joint file of another joint"
-    )
-    return c.issue(channel, "unit", text)
+    at = "of the load" if c.known_load else "at the sensor"
+    unit = _LOAD if c.known_load and channel == "torque_nm" else unit
+    text = f"found {size:.3g} Nm {at} per Nm of the motor (G Kt i), friction aside, expected about 1: {unit} suspected"
+    return c.issue(channel, "unit", f"{text}, or a joint file of another joint")
 
 
 def _slope(c: Channels) -> float | None:

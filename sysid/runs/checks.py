@@ -426,17 +426,11 @@ def _missing(c: Channels) -> RunIssue | None:
     """Return the first column that is missing or dead and without which a joint cannot be diagnosed."""
     torque = c.run.torque_nm
     if torque is None or not (np.any(torque) or c.known_load):
-        text = (
-            "found no valid torque sensor channel, expected the reference of a diagnosis: a sensor, or a known load or a "
-            "model's torque (jN.load of a column map)"
-        )
+        text = "found no valid torque sensor channel, expected one, or a known load or a model's torque (jN.load)"
         return c.issue("torque_nm", "missing", text)
     motion = [column for name in MOTION if (column := getattr(c.run, name)) is not None]
     if not c.known_load and np.ptp(torque) == 0.0 and any(np.ptp(column) > 0.0 for column in motion):
-        text = (
-            f"found {torque[0]:.4g} Nm in the whole run while the joint moves, expected a measurement that changes: dead "
-            "channel"
-        )
+        text = f"found {torque[0]:.4g} Nm in the whole run while the joint moves: dead channel"
         return c.issue("torque_nm", "dead", text)
     if c.run.current_a is None:
         return c.issue("current_a", "missing", "found no such column, expected the motor current")
@@ -456,8 +450,5 @@ def _opposite_sensors(usable: Mapping[int, JointColumns], name: str) -> list[Run
     size = float(np.std(one))
     if size == 0.0 or float(np.std(one + two)) > 0.2 * size:
         return []
-    text = (
-        f"{name}: j2.torque_nm: found the opposite of j1.torque_nm, expected the same (positive along each joint's own "
-        "positive current): the columns of one joint are in the frame of the other"
-    )
+    text = f"{name}: j2.torque_nm: found the opposite of j1.torque_nm: columns of one joint in the frame of the other"
     return [RunIssue("torque_nm_frame", text)]

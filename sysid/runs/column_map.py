@@ -259,9 +259,7 @@ SHARP: Final = 0.06
 """Noise of an acceleration, in parts of the largest: a fit of whole runs averages it, but no ripple that is lacking."""
 _FEWEST_ROWS: Final = 7
 _OUTLIER_RAD: Final = 0.1
-_SOURCE: Final = (
-    "a column of the file, an expression of columns, or {column: either, scale: 1.0, offset: 0.0}"
-)
+_SOURCE: Final = "a column of the file, an expression of columns, or {column: either, scale: 1, offset: 0}"
 
 
 @dataclass(frozen=True)

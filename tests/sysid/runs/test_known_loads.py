@@ -94,6 +94,16 @@ def test_a_current_is_judged_beside_a_known_load_too() -> None:
         assert any(fault in line for line in (*result.refused, *result.notes)), fault
 
 
+@pytest.mark.parametrize("factor", [1000.0, 30.0])
+def test_a_load_of_another_size_names_mass_and_lever(factor: float) -> None:
+    """A mass in grams is no torque in mNm: there is no sensor."""
+    table = run(6.0 * np.sin(Q))
+    load = factor * 6.0 * np.sin(Q)
+    [line] = checked(RunTable(T, {1: replace(table.joints[1], torque_nm=load)}), 1).refused
+    assert "mass_kg in g or lever_m in mm" in line
+    assert "sensor" not in line
+
+
 def test_two_known_loads_that_are_opposite_are_two_loads() -> None:
     one = run(6.0 * np.sin(Q)).joints[1]
     two = one.map(lambda _, x: -x)
