@@ -128,7 +128,7 @@ def runs_of(content: Content, *, whole: bool) -> list[RunFile]:
         notes.append(f"{counted(count - used, 'run')} of less than {SHORTEST_SEGMENT_S:g} s left out")
     if content.columns is not None:
         if count > 1:
-            what = "its turns in gaps are not known: an angle of a later segment may be off by whole periods"
+            what = "its turns in the gaps are unknown: an angle of later segments may be off by whole periods"
             sources = content.columns.sources().items()
             notes += [f"{key} is unwrapped, {what}" for key, column in sources if "unwrap(" in column.name]
         notes += content.columns.remarks()
