@@ -60,7 +60,7 @@ def test_no_motion_leaves_its_room(kind: str, room: JointRange) -> None:
         assert motion.velocity_rad_s[0] == motion.velocity_rad_s[-1] == 0.0
         turned = np.diff(motion.position_rad) * RATE_HZ
         between = 0.5 * (motion.velocity_rad_s[1:] + motion.velocity_rad_s[:-1])
-        assert turned == pytest.approx(between, abs=1e-9)
+        assert np.abs(turned - between).max() <= 1e-9
         assert 1.0 < motion.duration_s < 3600.0
 
 

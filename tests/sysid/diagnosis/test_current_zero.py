@@ -68,6 +68,7 @@ def alike(one: Cause) -> set[str]:
     return {name.split(" of ")[0] for name in one.names} - {"sensor_offset"}
 
 
+@pytest.mark.campaign  # both of them at once are told apart below
 def test_a_reading_without_power_settles_which_of_the_two_it_is() -> None:
     """Without the mark both names stay together: the trials of the generator show that."""
     (one,) = found(asymmetry_nm=1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis import dataset
 from jtqd.sysid.diagnosis import diagnose as module
+from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
 from jtqd.sysid.diagnosis.diagnose import combined, diagnose, one_sensor
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
@@ -30,7 +32,7 @@ from tests.estimator.effects.effect_signals import PLAIN, extended
 from tests.sysid.diagnosis.diagnose_core_helpers import rigid_run
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, RIPPLE, bench_run, cause, findings, value
 from validation.diagnosis.trials import joint_files, tables
-from validation.generator.draw import draw
+from validation.generator.draw import Case, draw
 
 
 def signals(table: RunTable, joint: Joint = PLAIN, name: str = "run") -> JointSignals:
@@ -175,38 +177,50 @@ def slice_of(table: RunTable, seconds: float) -> RunTable:
     return RunTable(table.time_s[:n], {1: replace(columns, **{k: getattr(columns, k)[:n] for k in names})})
 
 
-@pytest.mark.parametrize("lacking", [0, 1])
-def test_a_run_without_a_link_encoder_takes_the_torsion_balance_from_all(lacking: int) -> None:
-    findings = _without("link_position_rad", lacking)
+def test_a_run_without_a_link_encoder_takes_the_torsion_balance_from_all() -> None:
+    """Whether it comes first or not."""
+    findings = _found(_without("link_position_rad", 1))
     assert {g.balance for g in findings.gaps} == {"motor"}
     assert findings.verdict == NO_GAP
+    first, _ = usable_signals(_without("link_position_rad", 0), joint_files(_case()), (1,))
+    assert {c.balance for run in build_dataset(first, joint_files(_case())).runs for c in run.channels} == {
+        "motor"
+    }
 
 
 def test_a_run_without_the_sensor_is_left_out_and_named() -> None:
-    findings = _without("torque_nm", 1)
+    findings = _found(_without("torque_nm", 1))
     assert any("run2" in note and "torque_nm" in note for note in findings.channel_notes)
     assert findings.verdict == NO_GAP
 
 
 def test_a_run_of_another_rate_is_used_with_the_others() -> None:
-    case = draw(12, runs=5, duration_s=8.0)
-    runs = tables(case.runs)
+    runs = tables(_case().runs)
     name, table = runs[3]
     joints = {
         n: JointColumns(**{f.name: None if (x := getattr(c, f.name)) is None else x[::2] for f in fields(c)})
         for n, c in table.joints.items()
     }
     runs[3] = name, RunTable(table.time_s[::2], joints)
-    findings = diagnose(runs, joint_files(case))
+    findings = _found(runs)
     assert findings.used_runs == tuple(name for name, _ in runs)
     assert findings.verdict == NO_GAP
 
 
-def _without(name: str, which: int) -> Findings:
-    case = draw(12, runs=5, duration_s=8.0)
-    runs = tables(case.runs)
+@cache
+def _case() -> Case:
+    return draw(12, runs=5, duration_s=8.0)
+
+
+def _found(runs: list[tuple[str, RunTable]]) -> Findings:
+    """Of one joint of two; those of both are diagnosed in test_verdict."""
+    return diagnose(runs, {1: joint_files(_case())[1]})
+
+
+def _without(name: str, which: int) -> list[tuple[str, RunTable]]:
+    runs = tables(_case().runs)
     run, table = runs[which]
     velocity = {"link_velocity_rad_s": None} if name == "link_position_rad" else {}
     joints = {n: replace(c, **{name: None}, **velocity) for n, c in table.joints.items()}
     runs[which] = run, RunTable(table.time_s, joints)
-    return diagnose(runs, joint_files(case))
+    return runs

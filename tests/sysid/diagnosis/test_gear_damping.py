@@ -21,7 +21,9 @@ def diagnosed(truth: Joint, file: Joint = PLAIN, relevance: float = 1e-3) -> Fin
     return diagnose(runs, {1: file}, relevance=relevance)
 
 
-@pytest.mark.parametrize(("true", "in_file"), [(30.0, 8.0), (8.0, 30.0)])
+@pytest.mark.parametrize(
+    ("true", "in_file"), [pytest.param(30.0, 8.0, marks=pytest.mark.campaign), (8.0, 30.0)]
+)
 def test_a_wrong_damping_is_found_alone_and_is_no_delay(true: float, in_file: float) -> None:
     found = diagnosed(replace(PLAIN, damping_nms_per_rad=true), replace(PLAIN, damping_nms_per_rad=in_file))
     assert found.verdict == "cause", found.reasons

@@ -12,7 +12,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.dataset import usable_signals
-from jtqd.sysid.diagnosis.diagnose import diagnose
+from jtqd.sysid.diagnosis.diagnose import diagnose, without_outlier_runs
 from jtqd.sysid.diagnosis.findings import Findings, OutlierRun, to_mapping
 from jtqd.sysid.diagnosis.outlier_runs import (
     Comparison,
@@ -43,6 +43,12 @@ def changed(
         (name, RunTable(t.time_s, {1: change(t, t.joints[1])}) if k in where else t)
         for k, (name, t) in enumerate(all_runs)
     ]
+
+
+def odd_runs(all_runs: list[tuple[str, RunTable]]) -> list[OutlierRun]:
+    """What a diagnosis does first with these runs."""
+    signals, _ = usable_signals(all_runs, {1: PLAIN}, (1,), as_recorded=True)
+    return without_outlier_runs(signals, {1: PLAIN})[2]
 
 
 def current_gain(table: RunTable, c: JointColumns) -> JointColumns:
@@ -94,22 +100,22 @@ def test_one_run_is_named_and_the_joint_is_not(
 
 def test_a_gain_is_a_part_of_the_true_value() -> None:
     """A torque is regressed on what was read, of which a gain of 1.2 leaves a sixth; a current on what the motion needs."""
-    (more,) = diagnose(changed(runs(), [2], current_gain), {1: PLAIN}).outlier_runs
+    (more,) = odd_runs(changed(runs(), [2], current_gain))
     assert more.value == pytest.approx(0.08, abs=0.003)
-    (sensor,) = diagnose(changed(runs(), [2], sensor_gain), {1: PLAIN}).outlier_runs
+    (sensor,) = odd_runs(changed(runs(), [2], sensor_gain))
     assert (sensor.run, sensor.what, sensor.channel) == ("run2", "gain", "torque_nm")
     assert sensor.value == pytest.approx(0.2, abs=0.01)
 
 
 def test_what_all_runs_share_is_an_effect_and_days_are_none() -> None:
-    assert diagnose(runs(), {1: PLAIN}).outlier_runs == ()
+    assert odd_runs(runs()) == []
     shared = diagnose(changed(runs(), list(range(COUNT)), current_gain), {1: PLAIN})
     assert shared.outlier_runs == ()
     assert "torque_constant" in {name for cause in shared.causes for name in cause.names}
 
 
 def test_two_runs_cannot_tell_which_is_odd() -> None:
-    assert diagnose(changed(runs(count=2), [1], current_gain), {1: PLAIN}).outlier_runs == ()
+    assert odd_runs(changed(runs(count=2), [1], current_gain)) == []
 
 
 def test_size_of_a_deviation_beside_the_others() -> None:
@@ -140,7 +146,7 @@ def test_a_run_is_odd_by_what_sets_it_apart(own: float, strange: float, odd: boo
 
 def test_a_run_that_is_set_apart_by_something_else_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Comparison, "explains_excess", lambda *_: False)
-    assert diagnose(changed(runs(), [2], current_gain), {1: PLAIN}).outlier_runs == ()
+    assert odd_runs(changed(runs(), [2], current_gain)) == []
 
 
 def test_a_channel_that_is_all_noise_makes_no_run_odd() -> None:
@@ -160,7 +166,7 @@ def test_a_channel_that_is_all_noise_makes_no_run_odd() -> None:
         return replace(c, link_position_rad=None)
 
     idle = changed(changed(runs(), [2], without_power), list(range(COUNT)), one_encoder)
-    assert diagnose(idle, {1: PLAIN}).outlier_runs == ()
+    assert odd_runs(idle) == []
     table = dict(idle)["run2"]
     (signals,), _ = usable_signals([("run2", table)], {1: PLAIN}, (1,))
     gain, zero = Deviation("gain", "current_a", 1), Deviation("zero", "current_a", 1)

@@ -141,7 +141,11 @@ RIGS = (
 )
 
 
-@pytest.fixture(scope="module", params=range(3), ids=[f"{r.rate_hz:.0f} Hz" for r in RIGS])
+@pytest.fixture(
+    scope="module",
+    params=[0, pytest.param(1, marks=pytest.mark.campaign), 2],
+    ids=[f"{r.rate_hz:.0f} Hz" for r in RIGS],
+)
 def wrong_file(request: pytest.FixtureRequest) -> Case:
     seed = request.param
     runs = runs_of(TRUE, seed, 5, RIGS[seed])
@@ -197,7 +201,9 @@ def strange_friction(v: FloatArray, tau: FloatArray, theta: FloatArray) -> Float
     return np.asarray(lost * np.sign(v) + 0.4 * np.cos(2.0 * theta + 0.3))
 
 
-@pytest.fixture(scope="module", params=[3, 4, 6], ids=lambda n: f"{n} runs")
+@pytest.fixture(
+    scope="module", params=[3, pytest.param(4, marks=pytest.mark.campaign), 6], ids=lambda n: f"{n} runs"
+)
 def one_more(request: pytest.FixtureRequest) -> Case:
     rig = Rig(days=0.05)
     runs, fresh = (
@@ -244,7 +250,9 @@ def test_one_relevance_decides_whether_an_entry_is_a_cause(relevance: float, ver
     assert found.unexplained.relevant_nm == pytest.approx(relevance * ARM.rated_torque_nm)
 
 
-@pytest.mark.parametrize("zero_nm", [0.6, 1.8], ids=["1 % of rated", "3 % of rated"])
+@pytest.mark.parametrize(
+    "zero_nm", [0.6, pytest.param(1.8, marks=pytest.mark.campaign)], ids=["1 % of rated", "3 % of rated"]
+)
 def test_an_offset_of_current_or_sensor_of_one_joint_is_one_of_the_two(zero_nm: float) -> None:
     found = diagnose(runs_of(ARM, 5, 3, Rig(sensor_zero_nm=zero_nm)), {1: ARM})
     assert found.verdict == AMBIGUOUS
@@ -408,7 +416,7 @@ def test_the_runs_with_noise_are_filtered_as_the_runs_are() -> None:
         assert more.of_position == plain.of_position
 
 
-@pytest.mark.parametrize("delay_s", [0.007, 0.012])
+@pytest.mark.parametrize("delay_s", [pytest.param(0.007, marks=pytest.mark.campaign), 0.012])
 def test_a_delay_between_noisy_channels_has_its_size(delay_s: float) -> None:
     """Its regressor is a rate, noisier than what it is the rate of. With one encoder the current or the sensor is late."""
 
@@ -460,7 +468,9 @@ def test_outliers_are_looked_for_as_recorded_and_balances_judged_where_the_torqu
     assert any(f"below {COMPUTED_HZ:.0f} Hz" in note for note in found.channel_notes)
 
 
-@pytest.mark.parametrize(("part", "constant"), [(0.23, 0.95), (0.21, 1.08)])
+@pytest.mark.parametrize(
+    ("part", "constant"), [(0.23, 0.95), pytest.param(0.21, 1.08, marks=pytest.mark.campaign)]
+)
 def test_a_motor_that_saturates_by_a_third_settles(part: float, constant: float) -> None:
     """The current of the simulation follows from the saturation, and overshoots where it is strong."""
     plain = runs_of(ARM, 21, 4, Rig(moment_nm=40.0))
@@ -520,7 +530,7 @@ def test_an_interval_holds_the_gain_of_a_sensor_that_is_not_exact() -> None:
     assert j.z == pytest.approx(abs(solution.sets.fit(solution.chosen).mean[at][0]) / whole)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.campaign)])
 @pytest.mark.parametrize(
     ("key", "factor", "name"),
     [

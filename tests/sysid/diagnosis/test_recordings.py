@@ -33,8 +33,10 @@ def cut(table: RunTable, rows: slice, *, from_zero: bool = False) -> RunTable:
     return RunTable(time - time[0] if from_zero else time, joints)
 
 
-def signals(*runs: tuple[str, RunTable]) -> Sequence[Sequence[JointSignals]]:
-    found, _ = usable_signals([*runs, ("other", bench_run(seconds=6.0, phase=1.1))], JOINTS, (1, 2))
+def signals(
+    *runs: tuple[str, RunTable], numbers: tuple[int, ...] = (1, 2)
+) -> Sequence[Sequence[JointSignals]]:
+    found, _ = usable_signals([*runs, ("other", bench_run(seconds=6.0, phase=1.1))], JOINTS, numbers)
     return found
 
 
@@ -101,8 +103,8 @@ def test_pieces_of_one_recording_are_no_two_runs() -> None:
 
 def test_pieces_share_what_a_run_has_of_its_own_and_are_held_out_together() -> None:
     whole = bench_run(seconds=6.0)
-    found = signals(("a", cut(whole, slice(0, HALF))), ("b", cut(whole, slice(HALF, None))))
-    solution = solve(build_dataset([list(run) for run in found], JOINTS))
+    found = signals(("a", cut(whole, slice(0, HALF))), ("b", cut(whole, slice(HALF, None))), numbers=(1,))
+    solution = solve(build_dataset([list(run) for run in found], {1: JOINT}))
     assert len(solution.runs) == 3
     assert len(solution.equations.grams) == len(solution.own_means) == 2
     (squares, *_) = predict(solution).squares.values()

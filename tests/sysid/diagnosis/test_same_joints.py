@@ -57,7 +57,7 @@ def test_runs_with_the_same_joints_are_as_they_were(joints: tuple[int, ...]) -> 
 
 def two_joints(seed: int, *, first: bool) -> RunTable:
     """Both joints at one sensor; first: whether joint 1 can be used."""
-    run = rich_run(PLAIN, seed, seconds=10.0, noise=0.002)
+    run = rich_run(PLAIN, seed, seconds=10.0, step_s=4e-3, noise=0.002)
     one = run.joints[1]
     assert one.current_a is not None
     noise = np.random.default_rng(seed + 100).normal(0.0, 0.01, len(run.time_s))

@@ -27,7 +27,9 @@ def polled(table: RunTable, every: int) -> RunTable:
     return RunTable(table.time_s[::every], {1: JointColumns(**values)})
 
 
-@pytest.mark.parametrize("every", [1, 4, 10], ids=["1 kHz", "250 Hz", "100 Hz"])
+@pytest.mark.parametrize(
+    "every", [pytest.param(1, marks=pytest.mark.campaign), 4, 10], ids=["1 kHz", "250 Hz", "100 Hz"]
+)
 def test_a_torque_constant_is_found_as_it_is_whatever_the_rate_of_the_recorder(every: int) -> None:
     """The current's noise, 1 % of the rated one, is in the residual as well. As a regressor of single samples it
     explains itself: at 250 Hz the constant is then found smaller by five standard deviations.

@@ -68,7 +68,10 @@ def test_wrong_names_are_told(without: list[str], given: list[str], said: str) -
     assert said in str(caught.value)
 
 
-@pytest.mark.parametrize(("without", "given"), [("coulomb_friction", ""), ("", "coulomb_friction")])
+@pytest.mark.parametrize(
+    ("without", "given"),
+    [("coulomb_friction", ""), pytest.param("", "coulomb_friction", marks=pytest.mark.campaign)],
+)
 def test_what_all_runs_lack_is_no_noise_where_its_name_may_not_be_said(without: str, given: str) -> None:
     """The runs' own changes took it: `no_gap`, with a noise floor as high as the gap."""
     friction = JOINT.friction
