@@ -135,8 +135,16 @@ def rms(values):
 AT_ONCE = [row for row in LAWS if row.name != "channel_delay"]
 
 
-@pytest.mark.parametrize("number", [1, 2])
-@pytest.mark.parametrize("row", AT_ONCE, ids=[row.name for row in AT_ONCE])
+@pytest.mark.parametrize(
+    ("row", "number"),
+    [
+        pytest.param(
+            row, number, id=f"{row.name}-{number}", marks=[pytest.mark.campaign] * ((k + number) % 2)
+        )
+        for k, row in enumerate(AT_ONCE)
+        for number in (1, 2)
+    ],
+)
 def test_laws_explain_both_balances(row, number):
     h, rows = record(bench_with(row.name, row.parameters, number), number)
     moving = np.abs(rows[1, :-1]) / G > 0.05

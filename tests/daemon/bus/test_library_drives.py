@@ -128,12 +128,13 @@ def test_emcy_with_and_without_heartbeat(bench: LibraryBench) -> None:
 @pytest.mark.parametrize(
     "manners",
     [
-        ("--boot-ups", "2"),
-        ("--without", "1016,1029,1014"),
-        ("--without", "1019,1008"),
+        ("--boot-ups", "2", "--without", "1016,1029,1014,1019,1008"),
+        pytest.param(("--boot-ups", "2"), marks=pytest.mark.campaign),
+        pytest.param(("--without", "1016,1029,1014"), marks=pytest.mark.campaign),
+        pytest.param(("--without", "1019,1008"), marks=pytest.mark.campaign),
         pytest.param(("--sdo", "0.06", "--boot-ups", "2"), marks=pytest.mark.campaign),
     ],
-    ids=["boot-up twice", "no 1016h 1029h 1014h", "no 1019h 1008h", "slow, boot-up twice"],
+    ids=["all at once", "boot-up twice", "no 1016h 1029h 1014h", "no 1019h 1008h", "slow, boot-up twice"],
 )
 def test_devices_differ(manners: tuple[str, ...]) -> None:
     with a_bench(*manners) as bench, bench.served(longest_s=40.0):
