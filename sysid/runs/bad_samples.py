@@ -232,9 +232,7 @@ def _while_partner_moves(
         if not moving[start] or not moving[end - 1]:
             continue
         if time_s[end - 1] - time_s[start] >= STUCK_S and _range(partner[start:end]) > moved:
-            if value in at_limit and end < len(
-                values
-            ):  # a channel that never moves again has not reached a limit
+            if value in at_limit and end < len(values):  # one that never moves again has reached none
                 limits.add(value)
             else:
                 stuck[start:end] = True

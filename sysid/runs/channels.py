@@ -271,10 +271,8 @@ def _constant(c: Channels, name: str, partner_nm: FloatArray, moved_nm: float) -
     # a channel that never moves again has not reached a limit
     fault = "saturated" if extreme and np.any(channel[first[value] :] != value) else "stuck"
     unit, partner = ("Nm", "motor") if name == "torque_nm" else ("A", "measured")
-    text = (
-        f"found exactly {value:g} {unit} for {sum(held_s.values()):.2g} s of motion in which the {partner} torque moved by "
-        f"more than {moved_nm:g} Nm: {fault} channel"
-    )
+    held = f"found exactly {value:g} {unit} for {sum(held_s.values()):.2g} s of motion"
+    text = f"{held} in which the {partner} torque moved by more than {moved_nm:g} Nm: {fault} channel"
     yield c.issue(name, fault, text)
 
 

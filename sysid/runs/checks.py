@@ -320,6 +320,11 @@ def check_runs(
     )
 
 
+def may_leave_out(out: int, of: int) -> bool:
+    """Return whether so many of the recordings may be left out: fewer than half, so that no minority is judged alone."""
+    return 2 * out < of
+
+
 def channel_findings(runs: Sequence[RunFile], number: int, joint: Joint) -> list[RunIssue]:
     """Return what is wrong with one joint's channels in any run, including those that the reader found dead."""
     issues: list[RunIssue] = []

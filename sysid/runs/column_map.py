@@ -108,6 +108,7 @@ _REFUSED: Final[Mapping[type[ast.operator], str]] = {
     ast.FloorDiv: "//",
     ast.MatMult: "@",
 }
+NO_COLUMN: Final = "found no column"
 _ALLOWED: Final = "numbers, columns of the file, + - * /, pi and " + ", ".join(FUNCTIONS)
 
 
@@ -195,9 +196,7 @@ class _Compiler(NamedTuple):
         if name not in _CONSTANTS:
             few = ", ".join(f"'{each}'" for each in self.header[:4])
             there = few if len(self.header) <= 4 else f"{few}, ... {len(self.header)} in all"
-            raise ExpressionError(
-                f"found no column '{column}', expected it for {self.target} (there are {there})"
-            )
+            raise ExpressionError(f"{NO_COLUMN} '{column}', expected it for {self.target} ({there})")
         return lambda _: np.float64(_CONSTANTS[name])
 
     def _number(self, value: object) -> np.float64:
@@ -357,9 +356,7 @@ class ColumnMap:
             names = [name for name in by_run if name in str(path)]
             if len(names) != 1:
                 found = " and ".join(map(repr, names)) or f"none of {', '.join(map(repr, by_run))}"
-                raise ExpressionError(
-                    f"found {found} in the path, expected one, for j{n}.load of {self.where}"
-                )
+                raise ExpressionError(f"found {found} in the path, expected one: j{n}.load of {self.where}")
             loads[n] = by_run[names[0]]
         known = {f"j{n}.torque_nm" for n in loads}
         own = {name: Column(name) for name in targets() if name in header and name not in known}

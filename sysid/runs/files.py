@@ -27,11 +27,13 @@ import numpy.typing as npt
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.progress import progress
+from jtqd.sysid.runs.checks import may_leave_out
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.run_file import Content, RunError, RunFile, runs_of
+from jtqd.sysid.runs.run_file import Content, NoColumnError, RunError, RunFile, runs_of
 from jtqd.sysid.runs.tables import read_csv, read_parquet
 
 TABLES: Final = (".csv", ".csv.gz", ".parquet")
+LEFT_OUT: Final = "another recording is left out"
 LOGS: Final = (".mcap",)
 NO_RUNS: Final = (".", "next_experiment.")  # first part of a name: hidden, or written by a diagnosis
 _PART: Final = re.compile(r"(?P<run>.+-\d{8}T\d{6}Z(?:_\d+)?)-\d{4,}\.mcap", re.ASCII)
@@ -57,9 +59,7 @@ def run_paths(arguments: Sequence[Path]) -> list[Path]:
         names = sorted(p for p in argument.iterdir() if p.is_file() and not p.name.startswith(NO_RUNS))
         inside = [p for p in names if ends_in(p, TABLES)] or [p for p in names if ends_in(p, LOGS)]
         if not inside:
-            raise RunError(
-                f"{argument}: found no run file in it, expected names ending in {', '.join(TABLES + LOGS)}"
-            )
+            raise RunError(f"{argument}: found no run file in it, expected any of {', '.join(TABLES + LOGS)}")
         paths += inside
     if wrong := next((p for p in map(str, paths) if p != p.encode(errors="ignore").decode()), None):
         raise RunError(f"{wrong!r}: found a name that is not UTF-8, expected a file of another name")
@@ -86,12 +86,20 @@ def read_runs(
     runs: list[RunFile] = []
     said: set[str] = set()
     known: list[tuple[str, Windows]] = []
+    lacking: list[str] = []
     paths = run_paths(arguments)
     twice = next((path for path in paths if paths.count(path) > 1), None)
     if twice is not None:
         raise RunError(f"{twice}: found it twice, expected every run once")
-    for path, *parts in progress(_recordings(paths) if segments else [(p,) for p in paths], "reading runs"):
-        content = _content(path, *parts, columns=mapping, joints=joints, blanks=segments)
+    recordings = _recordings(paths) if segments else [(p,) for p in paths]
+    for path, *parts in progress(recordings, "reading runs"):
+        try:
+            content = _content(path, *parts, columns=mapping, joints=joints, blanks=segments)
+        except NoColumnError as error:
+            lacking.append(str(error))
+            if not segments or not may_leave_out(len(lacking), len(recordings)):
+                raise
+            continue
         read = runs_of(content, whole=not segments)
         same = next((other.name for other in runs if other.sha256 == read[0].sha256), None)
         if same is not None:
@@ -114,6 +122,7 @@ def read_runs(
             read[0] = replace(read[0], notes=tuple(note for note in read[0].notes if note not in said))
             said |= set(content.columns.remarks())
         runs += read
+    runs[0] = replace(runs[0], notes=(*runs[0].notes, *(f"{LEFT_OUT}: {error}" for error in lacking)))
     return runs
 
 

@@ -46,9 +46,7 @@ def joint_files(arguments: Sequence[str], columns: ColumnMap | None) -> dict[int
             raise UsageError(f"--joint: found two files {which}, expected one")
         files[number] = Path(match.group(2) if match else text)
     if ALL_JOINTS in files and len(files) > 1:
-        raise UsageError(
-            "--joint: found a file for all joints beside one for a single joint, expected either"
-        )
+        raise UsageError("--joint: found a file for all joints beside one for one joint, expected either")
     return files
 
 

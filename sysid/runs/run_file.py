@@ -26,6 +26,10 @@ class RunError(OneLineError):
     """A run file cannot be used; the message is one line: file, place, found, expected."""
 
 
+class NoColumnError(RunError):
+    """It lacks a column."""
+
+
 @dataclass(frozen=True)
 class RunFile:
     """A run as read: name for messages, unique among the runs read together; file, its kind ("csv", "parquet", "mcap") and
@@ -327,9 +331,7 @@ def _segment(content: Content, cut: slice, name: str, notes: Sequence[str], quie
         torque = columns["torque_nm"]
         zero = torque is not None and len(torque) >= DEAD_ROWS and not np.any(torque)
         if torque is not None and zero and joint not in known_loads:
-            notes.append(
-                f"j{joint}.torque_nm is exactly zero in all {len(torque)} rows: dead channel, not used"
-            )
+            notes.append(f"j{joint}.torque_nm is exactly zero in every row: dead channel, not used")
             columns["torque_nm"] = None
         joints[joint] = JointColumns(**columns)
     if not joints:

@@ -29,8 +29,8 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.files import whole_file, write_whole
 from jtqd.estimator.run import COLUMN_NAMES, RunTable
 from jtqd.estimator.text import counted
-from jtqd.sysid.runs.column_map import TIME, ColumnMap, Expression, ExpressionError
-from jtqd.sysid.runs.run_file import Content, RunError, file_bytes, header_place
+from jtqd.sysid.runs.column_map import NO_COLUMN, TIME, ColumnMap, Expression, ExpressionError
+from jtqd.sysid.runs.run_file import Content, NoColumnError, RunError, file_bytes, header_place
 
 _BLANK: Final = ("", "nan", "-nan", "nan(ind)", "-nan(ind)", "null", "none", "na", "n/a")
 """What recorders write for no value, in lower case."""
@@ -137,7 +137,7 @@ class _Wanted:
         """Parse the map for a file with these columns; None: the run table's own names. Raises RunError."""
         place = f"{path}:{header_place(path)}"
         if not (columns and columns.columns) and TIME not in header:
-            raise RunError(
+            raise NoColumnError(
                 f"{place} found no column '{TIME}' (first columns: {list(header[:4])}), expected the run table's names "
                 "or a column map"
             )
@@ -148,7 +148,8 @@ class _Wanted:
         try:
             return cls(path, columns, columns.parsed(list(header), place))
         except ExpressionError as error:
-            raise RunError(str(error)) from None
+            kind = NoColumnError if NO_COLUMN in str(error) else RunError
+            raise kind(str(error)) from None
 
     @property
     def names(self) -> list[str]:
@@ -179,9 +180,7 @@ class _Wanted:
         used = {key: each for key, each in self.expressions.items() if not absent & set(each.names)}
         names = _names(used)
         keep = ~np.any([blank[name] for name in names], axis=0)
-        found = [
-            f"column {name!r} is blank in every row: taken as absent" for name in cells if name in absent
-        ]
+        found = [f"column {n!r} is blank in every row: taken as absent" for n in cells if n in absent]
         count = {name: int(blank[name].sum()) for name in names if blank[name].any()}
         if count:
             which = ", ".join(f"{name!r} in {rows}" for name, rows in count.items())
@@ -194,9 +193,7 @@ class _Wanted:
             lines = [line for line, kept in zip(lines, keep, strict=True) if kept]
         kept_cells = {name: cells[name][keep] for name in names}
         sources = self.columns.sources()
-        with np.errstate(
-            over="ignore", invalid="ignore"
-        ):  # the run table refuses numbers that are not finite
+        with np.errstate(over="ignore", invalid="ignore"):  # not finite: refused by the run table
             values = {
                 key: sources[key].scale * each.value(kept_cells) + sources[key].offset
                 for key, each in used.items()

@@ -266,3 +266,18 @@ def test_any_text_is_an_expression_or_an_expression_error(text):
     except ExpressionError:
         return
     assert found.value(CELLS).shape == (3,)
+
+
+def test_a_run_that_lacks_a_column_is_left_out_and_named_while_most_have_it(tmp_path):
+    mapping = {"time_s": "t", "j1.current_a": "i", "j1.motor_position_rad": "q"}
+    columns = ColumnMap.from_mapping(mapping, "m", Path())
+    runs = [table(tmp_path / f"{k}.csv", {"t": T, "q": Q + k * V, "i": A + k}) for k in range(2)]
+    runs.append(table(tmp_path / "short.csv", {"t": T, "q": Q - V}))
+    first, second = read_runs(runs, columns, segments=True)
+    assert (first.name, second.name) == ("0.csv", "1.csv")
+    assert any(
+        "left out: " in note and "short.csv" in note and "no column 'i'" in note for note in first.notes
+    )
+    for arguments, segments in ((runs[1:], True), (runs, False)):
+        with pytest.raises(RunError, match=r"short\.csv.*no column 'i'"):
+            read_runs(arguments, columns, segments=segments)

@@ -172,7 +172,7 @@ def test_a_run_on_an_unknown_arm_is_not_diagnosed(tmp_path: Path) -> None:
     [
         (
             "{empty: {mass_kg: 1, lever_m: 0.3}}",
-            "found none of 'empty' in the path, expected one, for j1.load",
+            "found none of 'empty' in the path, expected one: j1.load",
         ),
         ("{run: {mass_kg: 1, lever_m: 0.3}, light: {mass_kg: 1, lever_m: 0.3}}", "found 'run' and 'light'"),
         (
