@@ -185,7 +185,7 @@ def _headline_cause(cause: Cause, files: Mapping[int, Joint]) -> str:
     size = _size(cause, files)
     if cause.grade != ONE_OF:
         return f"{_joined(': ', text, size)} ({cause.grade})."
-    return f"{text} ({size} if it is {effect_title(cause.name)})." if size else f"{text}."
+    return f"{text} ({size} if it is {entry_title(cause)})." if size else f"{text}."
 
 
 def _gain(findings: Findings) -> str:
@@ -209,7 +209,7 @@ def _row(cause: Cause, files: Mapping[int, Joint]) -> Row:
         elif name != "channel":
             size = rounded(v.value, v.unit) if v.fitted else f"{v.value:g} {unit_name(v.unit)}".rstrip()
             more.append(f"{parameter_title(name)} {size}")
-    title, share = effect_title(cause.name), _percent(cause.explained_share)
+    title, share = entry_title(cause), _percent(cause.explained_share)
     return Row(place(cause.joint), title, found, interval, share, _grade(cause), ", ".join(more))
 
 
@@ -259,7 +259,7 @@ def _grades(causes: Sequence[Cause], findings: Findings) -> str:
     if any(c.grade == ONE_OF for c in causes):
         texts.append("one of: these runs do not distinguish them")
     if doubtful is not None:
-        why = f" ({effect_title(doubtful.name)}: {doubtful.doubts[0]})" if doubtful.doubts else ""
+        why = f" ({entry_title(doubtful)}: {doubtful.doubts[0]})" if doubtful.doubts else ""
         texts.append(f"effective: predicts, but what it stands for is not settled{why}")
     return f"{'; '.join(texts)}." if texts else ""
 
@@ -343,6 +343,14 @@ def effect_title(name: str) -> str:
     return " ".join(_PROPER.get(word, word) for word in name.split("_"))
 
 
+def entry_title(cause: Cause) -> str:
+    """Return an entry in words: of an effect with a value of the file, this value where nothing else of it was found."""
+    values = [p.name for p in EFFECTS[cause.name].parameters if p.key]
+    others = {p.name for p in EFFECTS[cause.name].parameters if not p.key}
+    only = values and others and not any(cause.parameters[n].fitted for n in others & {*cause.parameters})
+    return parameter_title(values[0]) if only else effect_title(cause.name)
+
+
 def parameter_title(name: str) -> str:
     """Return the name of a parameter in words, without its unit: "amplitude_nm" is "amplitude"."""
     return effect_title(_UNIT_ENDING.sub("", name))
@@ -361,7 +369,7 @@ def place(joint: JointName) -> str:
 
 def _of(cause: Cause) -> str:
     """Return effect and place: "torque ripple of joint 1", "sensor gain"."""
-    title = effect_title(cause.name)
+    title = entry_title(cause)
     if cause.joint == SENSOR:
         return title if title.startswith(SENSOR) else f"{title} of the torque sensor"
     return f"{title} of {place(cause.joint)}"

@@ -275,6 +275,26 @@ def test_provenance_has_twelve_digits_of_every_hash() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("cubic", "words"), [(None, "stiffness"), (0.0, "stiffness"), (1e8, "nonlinear stiffness")]
+)
+def test_a_stiffness_that_is_wrong_is_named_stiffness(cubic: float | None, words: str) -> None:
+    parameters = {"stiffness_nm_per_rad": value(9643.0, 90.0, "Nm/rad")}
+    if cubic is not None:
+        parameters["cubic_nm_per_rad3"] = value(cubic, 0.1 * cubic, "Nm/rad3")
+    found = replace(
+        examples.one_cause(),
+        causes=(
+            replace(
+                examples.one_cause().causes[0], name="nonlinear_stiffness", joint=1, parameters=parameters
+            ),
+        ),
+    )
+    assert [row.entry for row in summary(found).rows] == [words]
+    assert headline(found)[0].startswith(f"{words.capitalize()} of joint 1 explains")
+    assert to_mapping(found)["causes"][0]["name"] == "nonlinear_stiffness"
+
+
 def test_names_are_words() -> None:
     assert [effect_title(n) for n in ("stribeck_friction", "torque_ripple")] == [
         "Stribeck friction",
