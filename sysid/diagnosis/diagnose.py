@@ -47,6 +47,7 @@ from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.diagnosis.smoothing import noise_of
 from jtqd.sysid.diagnosis.unexplained import events_left, remaining
 from jtqd.sysid.diagnosis.verdict import conclude, present_of
+from jtqd.sysid.runs.checks import may_leave_out
 
 _WORST_FIRST: Final = (UNEXPLAINED, AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP)
 
@@ -187,7 +188,7 @@ def without_outlier_runs(
     outliers: list[OutlierRun] = []
     dataset = build_dataset(signals, joints, scope)
     count = len(set(recordings(signals)))
-    while 2 * (len(outliers) + 1) < count:
+    while may_leave_out(len(outliers) + 1, count):
         found = outlier_run(dataset)
         if found is None:
             break

@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from jtqd import __version__
+from jtqd.estimator.arrays import BoolArray
 from jtqd.estimator.run import RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.command import main
@@ -547,3 +548,47 @@ def test_one_bad_run_is_left_out_and_noted(tmp_path: Path, core: Core) -> None:
     made = made_in(tmp_path / "o")
     assert made["verdict"] == "cause"
     assert any(note.startswith("z.csv: j1.torque_nm") for note in made["channel_notes"])
+
+
+@pytest.mark.parametrize(("bad", "good"), [(2, 3), (2, 2), (3, 2)])
+def test_fewer_than_half_of_the_recordings_may_be_left_out(
+    tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str], bad: int, good: int
+) -> None:
+    """A load or a joint file that most runs contradict is not judged by the others; one line for the runs alike."""
+    judged = bad < good
+    write_runs(tmp_path, good)
+    for k in range(bad):
+        write_run(tmp_path / f"z{k}.csv", in_millinewtonmetres(bench_run(phase=2.0 + k)))
+    assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "o") == 3
+    out, err = capsys.readouterr()
+    made = made_in(tmp_path / "o")
+    assert made["verdict"] == ("cause" if judged else "insufficient_data")
+    assert len(core.asked) == judged
+    text = out + err
+    assert text.count("mNm suspected") == 2  # joints 1 and 2
+    assert text.count(f"the same in {bad} runs: z0.csv, z1.csv") == 2
+    if not judged:
+        assert made["reasons"][0].startswith(
+            f"joint 1: found {bad} of {bad + good} recordings that cannot be used"
+        )
+        assert "mNm" not in err
+
+
+def segment(table: RunTable, keep: BoolArray) -> RunTable:
+    joints = {number: columns.map(lambda _, x: x[keep]) for number, columns in table.joints.items()}
+    return RunTable(table.time_s[keep], joints)
+
+
+def test_a_piece_that_cannot_be_used_is_no_recording(tmp_path: Path, core: Core) -> None:
+    """Of a recording with a gap one piece may be without the sensor's torque; the other one is used."""
+    for k in range(2):
+        table = bench_run(phase=0.7 * k, seconds=6.0)
+        keep = (table.time_s < 2.5) | (table.time_s > 3.0)
+        joints = {}
+        for number, columns in table.joints.items():
+            assert columns.torque_nm is not None
+            held = np.where(table.time_s > 3.0, 5.0, columns.torque_nm)
+            joints[number] = replace(columns, torque_nm=held)
+        write_run(tmp_path / f"{k}.csv", segment(RunTable(table.time_s, joints), keep))
+    run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "o")
+    assert [name for name, _ in core.asked[0][0]] == ["0.csv (1 of 2)", "1.csv (1 of 2)"]
