@@ -229,7 +229,7 @@ def _positions(c: Channels) -> Iterator[RunIssue]:
     twist = TWIST_RAD + _SOFTER * min(loads, default=0.0) / c.joint.stiffness_nm_per_rad
     tolerance = max(RATIO_TOLERANCE, twist / swing if swing > 0.0 else math.inf)
     if ratio is not None and abs(abs(ratio) / gear - 1.0) > tolerance:
-        text = f"found {abs(ratio):.5g} motor turns per link turn, {c.joint.name} has gear_ratio {gear:g}"
+        text = f"found {abs(ratio):.5g} motor turns per link turn, expected gear_ratio {gear:g} of {c.joint.name}"
         yield RunIssue("gear_ratio", f"{c.where}: {text}: wrong gear ratio, or a position scaled wrongly")
 
 
