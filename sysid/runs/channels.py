@@ -286,7 +286,7 @@ def _signs(c: Channels, speed: FloatArray, motor_nm: FloatArray, torque: FloatAr
     lost_if_torque = float(integral(c.time_s, np.where(loaded, (motor_nm + torque) * speed, 0.0))[-1])
     swapped, other = ("torque_nm", "current_a") if lost_if_torque > 0.0 else ("current_a", "torque_nm")
     text = f"found the opposite sign of {other} under load (a gain of energy): swapped sign of {swapped}"
-    yield c.issue(swapped, "sign", text)
+    yield c.issue(swapped, "sign", f"{text}{', or hangs_at_rad off by pi' if c.known_load else ''}")
 
 
 def check_energy(c: Channels) -> Iterator[RunIssue]:

@@ -86,7 +86,7 @@ def test_a_current_is_judged_beside_a_known_load_too() -> None:
     held[1000:4000] = held[1000]
     for current, fault in (
         (1000.0 * columns.current_a, "mA"),
-        (-columns.current_a, "sign"),
+        (-columns.current_a, "sign of current_a, or hangs_at_rad off by pi"),
         (0.0 * columns.current_a, "dead channel"),
         (held, "stuck channel"),
     ):
