@@ -28,7 +28,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.signals import COMPUTED_HZ, SLOWEST_RAD_S, Channel, JointSignals, Line
-from jtqd.sysid.diagnosis.smoothing import second_difference
+from jtqd.sysid.diagnosis.smoothing import below, second_difference
 
 BIN_S: Final = 0.005
 SAME_RATE: Final = 0.05
@@ -318,7 +318,10 @@ def _nuisance(s: JointSignals, balance: str, family: Family) -> FloatArray | Non
     if family.joint not in {0, s.number}:
         return None
     if family.name == "zero" or family.name in _SMOOTHING:
-        torque = s.reading_nm if family.name in _SMOOTHING else np.ones(len(s.time_s))
+        smooth = (
+            family.name in _SMOOTHING
+        )  # printed steps are not, and four times differentiated all that there is
+        torque = below(s.reading_nm, s.step_s, 2.0 * COMPUTED_HZ) if smooth else np.ones(len(s.time_s))
         for _ in range(_SMOOTHING.get(family.name, 0)):
             torque = second_difference(torque, s.time_s) / (2.0 * math.pi * COMPUTED_HZ) ** 2
         return -torque * (s.per_torque if balance == MOTOR else 1.0)
