@@ -275,12 +275,16 @@ class Sets:
             out.setdefault((*e.key, e.slot[-1]), []).append(k)
         return [tuple(members) for members in out.values()]
 
-    def without(self, chosen: Set, members: Sequence[int]) -> Set:
-        """Return the set of most evidence without an effect."""
+    def like(self, members: Sequence[int]) -> Set:
+        """Return all entries of which one takes the place of an effect's."""
         one = self.entries[members[0]]
-        same = frozenset(
+        return frozenset(
             k for k, e in enumerate(self.entries) if e.key == one.key and e.slot[-1] == one.slot[-1]
         )
+
+    def without(self, chosen: Set, members: Sequence[int]) -> Set:
+        """Return the set of most evidence without an effect."""
+        same = self.like(members)
         return self.search(chosen - same, banned=same, steps=_RIVAL_STEPS)
 
     def _additions(self, chosen: Set, banned: Set) -> list[Set]:

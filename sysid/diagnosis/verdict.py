@@ -21,7 +21,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
-from jtqd.estimator.effects.effect import TORSION, Effect
+from jtqd.estimator.effects.effect import TORSION, Effect, Values
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.entries import Entry, present_effects
@@ -244,8 +244,8 @@ def _rms_of(table: FloatArray, column: int) -> float:
 class Judged:
     """Entries that are one effect, in the set: their places, rms per channel [Nm], twice the log evidence that the best set
     without them lacks, and that the set without them lacks where a discrepancy may imitate them, that best set's entries
-    instead, deviations of the coefficients [z] from none; how much their size differs from run to run, and the standard
-    error of its mean over runs, parts of it.
+    instead, least deviations of the coefficients [z] from none, in the set and its rivals; how much their size differs from
+    run to run, and the standard error of its mean over runs, parts of it; the values that rivals give them.
     """
 
     members: tuple[int, ...]
@@ -257,6 +257,7 @@ class Judged:
     z: float
     differs: float
     error: float
+    elsewhere: tuple[Values, ...] = ()
 
 
 def present_of(solution: Solution) -> tuple[list[Present], FloatArray]:
@@ -282,27 +283,35 @@ def judged(solution: Solution) -> list[Judged]:
     )
     imitating = recorder.sets(solution.variances, chosen)
     sizes = Sizes(fits_without(solution), chosen)
-    values = sets.fit(chosen)
+    effects = sets.effects(chosen)
+    without = [sets.without(chosen, members) for members in effects]
+    lacks = {rival: plain.lacks(chosen, rival) for rival in without}
+    alike = [chosen, *(rival for rival, lack in lacks.items() if lack <= limits.RIVAL)]
     places = sets.places(chosen)
     out = []
-    for members in sets.effects(chosen):
-        found = [(solution.entries[k], values.mean[places[k]]) for k in members]
-        [present] = present_effects(found)
-        rival = sets.without(chosen, members)
-        imitated = imitating.fit(chosen).evidence - imitating.fit(chosen - set(members)).evidence
+    for members in effects:
+        none = [rival for rival in lacks if not rival & sets.like(members)]
+        rival = min(none, key=lambda r: lacks[r])
         at = np.concatenate([np.arange(places[k].start, places[k].stop) for k in members])
-        mean = values.mean[at]
-        z2 = float(mean @ np.linalg.solve(solution.covariance[np.ix_(at, at)], mean))
+        inner = solution.covariance[np.ix_(at, at)]
+        z2, present = [], []
+        for every in (s for s in alike if s.issuperset(members)):
+            there, mean = sets.places(every), sets.fit(every).mean
+            present += present_effects([(solution.entries[k], mean[there[k]]) for k in members])
+            mean = np.concatenate([mean[there[k]] for k in members])
+            z2.append(float(mean @ np.linalg.solve(inner, mean)))
+        imitated = imitating.fit(chosen).evidence - imitating.fit(chosen - set(members)).evidence
         out.append(
             Judged(
                 members,
-                present,
-                _rms(solution, present),
-                plain.lacks(chosen, rival),
+                present[0],
+                _rms(solution, present[0]),
+                lacks[rival],
                 2.0 * imitated,
                 tuple(sets.entries[k] for k in rival - chosen),
-                math.sqrt(max(z2, 0.0)),
+                math.sqrt(max(min(z2), 0.0)),
                 *sizes.over_runs(at),
+                tuple(p.values for p in present[1:]),
             )
         )
     return out
@@ -412,7 +421,9 @@ def _cause(
 
 
 def values_of(solution: Solution, j: Judged) -> dict[str, Value]:
-    """Return the parameters of an effect with 95 % intervals, no narrower than what the equations simplify."""
+    """Return the parameters of an effect with 95 % intervals, no narrower than what the equations simplify, that hold what
+    rival sets make of it.
+    """
     fit = solution.sets.fit(solution.chosen)
     places = solution.sets.places(solution.chosen)
     half: dict[str, float] = dict.fromkeys(j.present.values, 0.0)
@@ -437,7 +448,8 @@ def values_of(solution: Solution, j: Judged) -> dict[str, Value]:
         without = 0.0 if p.name.startswith("reference") else none.get(p.name, 0.0)
         size = 1.0 if p.name == "phase_rad" else abs(value - without)
         wide = math.hypot(half[p.name], limits.INACCURATE * size)
-        low, high = value - wide, value + wide
+        every = [value, *(x[p.name] for x in j.elsewhere if p.name != "phase_rad")]
+        low, high = min(every) - wide, max(every) + wide
         if p.name != "phase_rad":
             low, high = max(low, p.low), min(high, p.high)
         out[p.name] = Value(value, (low, high), p.unit)

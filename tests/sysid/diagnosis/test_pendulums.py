@@ -13,6 +13,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis import diagnose as diagnosis
+from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.dataset import Dataset, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose, disturbed_signals
 from jtqd.sysid.diagnosis.findings import (
@@ -29,7 +30,7 @@ from jtqd.sysid.diagnosis.findings import (
 from jtqd.sysid.diagnosis.limits import PRIORS
 from jtqd.sysid.diagnosis.model import Solution, between, solve
 from jtqd.sysid.diagnosis.signals import COMPUTED_HZ
-from jtqd.sysid.diagnosis.verdict import judged, values_of
+from jtqd.sysid.diagnosis.verdict import effects_of, judged, values_of
 from jtqd.sysid.runs.column_map import motion_of
 from tests.sysid.diagnosis.pendulums import (
     ARM,
@@ -565,3 +566,31 @@ def test_a_friction_that_is_wrong_in_every_run_is_no_friction_of_the_day(
     assert value.ci95[0] < 5.0 < value.ci95[1]
     assert found.gain is not None
     assert found.gain.rmse_after_nm < 0.1 * found.gain.rmse_before_nm
+
+
+def test_rivals_of_one_entry_are_rivals_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A set that has as much evidence without two entries leaves neither certain, and what it makes of a third is in its
+    interval.
+    """
+    solution = solved(
+        replace(ARM, torque_constant_nm_per_a=0.85 * KT, friction=Friction(1.5, 2.0)), runs_of(ARM, 23, 3)
+    )
+    chosen, sets = solution.chosen, solution.sets
+    effects = sets.effects(chosen)
+    assert len(effects) > 2
+    both = chosen - set(effects[0]) - set(effects[1])
+    without = type(sets).without
+    monkeypatch.setattr(
+        type(sets), "without", lambda s, c, m: both if tuple(m) == effects[0] else without(s, c, m)
+    )
+    monkeypatch.setattr(limits, "RIVAL", 1e9)
+    found = {j.members: j for j in judged(solution)}
+    apart = solution.equations.sets(solution.variances, chosen, resembling=False)
+    less = without(sets, chosen, effects[1])
+    want = min(apart.lacks(chosen, both), apart.lacks(chosen, less))
+    assert found[effects[1]].delta == pytest.approx(want)
+    third = found[effects[2]]
+    [there] = [p for p in effects_of(solution, both, sets.fit(both).mean) if p.effect is third.present.effect]
+    for name, value in values_of(solution, third).items():
+        assert value.ci95[0] <= there.values[name] <= value.ci95[1]
+    assert any(abs(there.values[n] - v) > 0.0 for n, v in third.present.values.items())
