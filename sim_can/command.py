@@ -187,3 +187,7 @@ def _print_cost(options: argparse.Namespace, parameters: AnyPlant) -> int:
     for text, microseconds in rows:
         print(f"{text:66}{microseconds:7.1f} us")
     return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -196,3 +196,7 @@ def draw(log: Records, joint: int, path: Path, shadow: Records | None = None) ->
         figure.savefig(file, format=path.suffix[1:].lower(), dpi=110)
     plt.close(figure)
     return error_nm
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -62,3 +62,7 @@ def main(argv: list[str]) -> int:
     bounds = f"worst case {load.worst:.1%}, without stuff bits {load.unstuffed:.1%}, limit {LIMIT:.0%}"
     print(bounds if fits else f"{bounds}: does not fit")
     return 0 if fits else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

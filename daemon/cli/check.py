@@ -227,3 +227,7 @@ def _bus(name: str, config: Config, daemon: Daemon | None) -> Iterator[str]:
             yield f"unix:{path}"
         finally:
             bench.end()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -92,3 +92,7 @@ def _kind(action: argparse.Action) -> str | None:
     if metavar == "DIR" or metavar.endswith("_DIR"):
         return "directory"
     return "file" if action.type is Path or any(word in metavar for word in _FILE_WORDS) else None
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

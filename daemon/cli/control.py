@@ -82,3 +82,7 @@ def ask(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]
     if not isinstance(reply, dict) or not isinstance(reply.get("ok"), bool):
         raise ValueError(f"{path}: found a reply without 'ok', expected a JSON object with it")
     return reply
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -16,6 +16,7 @@ import resource
 import shutil
 import socket
 import subprocess
+import sys
 import time
 from base64 import urlsafe_b64decode
 from collections.abc import Iterator
@@ -500,3 +501,7 @@ def _remains(log: Path | None, search: DaemonSearch) -> Iterator[CheckResult]:
         text = ", ".join(map(str, search.abandoned))
         hint = "runtime directories; removed by the next start, or remove them manually"
         yield CheckResult("killed daemons", WARN, text, hint)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

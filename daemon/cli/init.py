@@ -397,3 +397,7 @@ def _fitting_period_us(path: Path, bitrate: int, text: Callable[..., str]) -> in
         if bus_load_of(load_config(path)).worst <= LIMIT:
             return period_us
     raise ConfigError(f"{path}: at {bitrate} bit/s not even 100 Hz fit the bus")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

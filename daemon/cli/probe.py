@@ -231,3 +231,7 @@ def text(
     if problems:
         lines += ["jtqd does not work with it yet:", *(f"  {line}" for line in problems)]
     return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -663,3 +663,7 @@ def _lines(daemon: Daemon) -> int:
             print(plain_line(reader, reading.earlier, reading.view, bitrate, contacts=watched), flush=True)
         time.sleep(_PLAIN_PERIOD_S)
     return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

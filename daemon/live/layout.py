@@ -68,3 +68,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"jtq layout: {arguments.out}: {error.strerror}", file=sys.stderr)
         return 1
     return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

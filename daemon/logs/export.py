@@ -513,3 +513,7 @@ def _joined(blocks: list[Columns]) -> Columns:
 
 def _length(block: Columns) -> int:
     return len(next(iter(block.values())))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

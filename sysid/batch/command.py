@@ -751,3 +751,7 @@ def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
     add("--again", action="store_true", help="run finished groups again")
     add("--json", action="store_true", help="print summary.json")
     return made
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -506,3 +506,7 @@ def _commander_log(reporter: Reporter) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.propagate = propagate
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

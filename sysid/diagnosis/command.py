@@ -495,3 +495,7 @@ def _record(cause: Cause) -> dict[str, Any]:
 
 def _rounded(value: float) -> float:
     return float(f"{float(value):.{_DIGITS}g}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -192,3 +192,7 @@ def _written(path: Path, mapping: Mapping[str, Any], page: str) -> str:
 
 def _made() -> str:
     return f"{BY}, {dt.datetime.now().astimezone():%Y-%m-%d %H:%M}"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -438,3 +438,7 @@ KINDS: Final = {
         _fit_losses,
     ),
 }
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -207,3 +207,7 @@ def _shown(column: str) -> str:
 def _cells(guess: Guess) -> tuple[str, str, str, str]:
     target = f"j{guess.joint}.{guess.target}" if guess.target != "time_s" else "time_s"
     return _shown(guess.column), target if guess.target else "-", guess.unit or "-", "; ".join(guess.why)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

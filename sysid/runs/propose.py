@@ -180,8 +180,9 @@ def propose(tables: Sequence[Table]) -> Proposal:
     _set_joints(columns)
     numbers = sorted({each.joint for each in columns if each.used})
     if not numbers:
-        expected = "expected words such as current, position, torque"
-        raise ProposalError(f"found no column that its name makes one of a joint, {expected}")
+        raise ProposalError(
+            "found no column that its name makes one of a joint, expected words such as position"
+        )
     joints = [_Joint(n, [x for x in columns if x.used and x.joint == n], seconds) for n in numbers]
     proposals = tuple(each.proposal() for each in joints)
     _check_together([each for each in columns if each.target])

@@ -335,9 +335,7 @@ def _segment(content: Content, cut: slice, name: str, notes: Sequence[str], quie
             columns["torque_nm"] = None
         joints[joint] = JointColumns(**columns)
     if not joints:
-        raise RunError(
-            f"{path}:{header_place(path)} found no joint's columns, expected at least one of j1.current_a, ..."
-        )
+        raise RunError(f"{path}:{header_place(path)} found no joint's columns, expected j1.current_a, ...")
     try:
         table = RunTable(time_s=values[TIME], joints=joints)
     except RunTableError as error:  # a scale of the column map that leaves the range of a float

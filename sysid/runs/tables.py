@@ -174,9 +174,7 @@ class _Wanted:
         for key, each in self.expressions.items():
             name = next((name for name in each.names if name in absent), None)
             if name is not None and (key == TIME or key.partition(".")[0] in made):
-                raise RunError(
-                    f"{self.path}: column {name!r}: found it blank in every row, expected numbers for {key}"
-                )
+                raise RunError(f"{self.path}: column {name!r}: found it blank in every row, expected {key}")
         used = {key: each for key, each in self.expressions.items() if not absent & set(each.names)}
         names = _names(used)
         keep = ~np.any([blank[name] for name in names], axis=0)

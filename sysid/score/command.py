@@ -325,3 +325,7 @@ def parser() -> argparse.ArgumentParser:
     add_columns(parser)
     parser.add_argument("--json", action="store_true", help="print the table as JSON (jtq.score/1)")
     return parser
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -265,3 +265,7 @@ def _train_joint(
         "runs": count,
         "gate": None if gate is None else gate.to_mapping(),
     }
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,5 +1,6 @@
 """`jtq`: version, unknown commands, and how it ends: a closed pipe, Ctrl-C; options before a log."""
 
+import importlib.util
 import itertools
 import os
 import select
@@ -7,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -25,6 +27,19 @@ def test_both_programs_print_one_version(main, capsys):
     except SystemExit as ended:
         status = ended.code
     assert (status, capsys.readouterr().out) == (0, f"jtqd {jtqd.__version__}\n")
+
+
+@pytest.mark.parametrize("module", sorted({*(m for m, _ in jtq.COMMANDS.values()), *jtq.FORMS.values()}))
+def test_the_module_of_a_command_is_a_program(module):
+    """`python -m` of a module that does nothing and exits with 0 would look like success."""
+    path = importlib.util.find_spec(module).origin
+    assert 'if __name__ == "__main__":\n' in Path(path).read_text()
+
+
+def test_a_module_that_is_run_without_arguments_is_a_usage_error():
+    command = [sys.executable, "-m", "jtqd.sysid.diagnosis.command"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (2, "")
 
 
 def test_an_unknown_command_is_answered_with_its_neighbour(capsys):
