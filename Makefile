@@ -27,12 +27,12 @@ test: style ## everything but the tests marked campaign
 	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part.
 	$(BIN)/python -m compileall -q daemon drivers estimator models sim_can sysid tests tools validation
 	@status=0; \
-	$(MAKE) --no-print-directory -k -j3 --output-sync=target test-native test-here test-guest test-hidden types || status=$$?; \
+	$(MAKE) --no-print-directory -k -j5 --output-sync=target test-guest test-native test-here test-hidden types || status=$$?; \
 	$(MAKE) --no-print-directory test-alone || status=$$?; \
 	exit $$status
 
-# Two that compute, each with one thread, beside one that mostly waits and comes before them: the bench kernel keeps a time of
-# its own, so none feels the others.
+# All lanes at once: the native one mostly waits and comes before those that compute, which share the processors to the end.
+# The bench kernel keeps a time of its own, so it feels none of them.
 BEHIND := nice -n 10
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 # In the lane of the guest, which is the shorter one.
