@@ -284,7 +284,7 @@ def judged(solution: Solution) -> list[Judged]:
     imitating = recorder.sets(solution.variances, chosen)
     sizes = Sizes(fits_without(solution), chosen)
     effects = sets.effects(chosen)
-    without = [sets.without(chosen, members) for members in effects]
+    without = [plain.without(chosen, members) for members in effects]
     lacks = {rival: plain.lacks(chosen, rival) for rival in without}
     alike = [chosen, *(rival for rival, lack in lacks.items() if lack <= limits.RIVAL)]
     places = sets.places(chosen)

@@ -209,7 +209,7 @@ def test_what_a_certain_entry_must_survive(solution: Solution) -> None:
     for j in own:
         dropped, sets = chosen - set(j.members), solution.sets
         imitated = 2.0 * (sets.fit(chosen).evidence - sets.fit(dropped).evidence)
-        rival = sets.without(chosen, j.members)
+        rival = apart.without(chosen, j.members)
         assert j.delta == pytest.approx(apart.lacks(chosen, rival))
         assert 0.99 * imitated < j.imitated < imitated, "a recorder within its step imitates a little of it"
         assert j.imitated < 2.0 * (apart.fit(chosen).evidence - apart.fit(dropped).evidence)

@@ -586,7 +586,7 @@ def test_rivals_of_one_entry_are_rivals_of_all(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(limits, "RIVAL", 1e9)
     found = {j.members: j for j in judged(solution)}
     apart = solution.equations.sets(solution.variances, chosen, resembling=False)
-    less = without(sets, chosen, effects[1])
+    less = without(apart, chosen, effects[1])
     want = min(apart.lacks(chosen, both), apart.lacks(chosen, less))
     assert found[effects[1]].delta == pytest.approx(want)
     third = found[effects[2]]
