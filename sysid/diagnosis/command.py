@@ -470,15 +470,18 @@ def extended_title(number: int, findings: Findings) -> str:
 def write_extended(
     directory: Path, joints: Mapping[int, Joint], findings: Findings, **origin: Any
 ) -> list[str]:
-    """Write the extended file of the joint, or one of each joint, into `directory`; returns their names.
+    """Write the extended file of the joint with the largest cause (else gap), and of several joints one of each, too, into
+    `directory`; returns their names.
 
     origin: sha256 and date of `extended`. Raises ConfigError.
     """
-    names = {n: f"extended.joint{n}.yaml" if len(joints) > 1 else EXTENDED for n in sorted(joints)}
-    for number, name in names.items():
+    largest = [*(c.joint for c in findings.causes), *(g.joint for g in findings.gaps), *sorted(joints)]
+    names = {EXTENDED: next(int(n) for n in largest if n in joints)}
+    names |= {f"extended.joint{n}.yaml": n for n in sorted(joints) if len(joints) > 1}
+    for name, number in names.items():
         joint = extended(joints[number], number, findings, **origin)
         write_joint(directory / name, joint, extended_title(number, findings))
-    return list(names.values())
+    return list(names)
 
 
 def _record(cause: Cause) -> dict[str, Any]:

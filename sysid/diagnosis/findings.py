@@ -432,7 +432,11 @@ def _cause(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:
         change = known[name].change(value.value) if name in known else None
         of_file = {"file_value": known[name].value, "change": change} if name in known else {}
         values[name] = {"value": value.value, "ci95": value.ci95, "unit": value.unit} | of_file
-    more = {"class": cause.names, "parameters": values, "evidence": {"delta_bic": cause.delta_evidence}}
+    evidence = {
+        "delta_bic": cause.delta_evidence,
+        "held_out_gain": None,
+    }  # of a single entry: promised, not measured
+    more = {"class": cause.names, "parameters": values, "evidence": evidence}
     return {key: value for key, value in vars(cause).items() if key != "delta_evidence"} | more
 
 

@@ -161,7 +161,7 @@ def test_an_arm_gets_a_motion_of_one_joint_within_the_limits(place: Path) -> Non
     assert not any("sensor_crosstalk" in cause["class"] for cause in found["causes"])
     experiment = found["next_experiment"]
     assert experiment["plan"] is None
-    motion = experiment["motion"]
+    motion = experiment["motions"]["next_experiment.motion.csv"]
     assert motion["joint"] == 4
     assert motion["velocity_rad_s"] <= 0.5
     assert motion["torque_nm"] == 20.0

@@ -91,11 +91,11 @@ def test_status_and_files_by_verdict(
     assert made["verdict"] == verdict
     assert [each["name"] for each in made["runs"]] == ["a.csv", "b.csv.gz", "c.csv"]
     assert all(len(each["sha256"]) == 64 for each in made["runs"])
-    names = ["extended.joint1.yaml", "extended.joint2.yaml", "report.html"]
+    names = ["extended.joint.yaml", "extended.joint1.yaml", "extended.joint2.yaml", "report.html"]
     assert sorted(made["files"]) == names
     assert sorted(path.name for path in out.iterdir()) == sorted([*names, "findings.json"])
     assert (out / "report.html").read_text() == f"<html>{verdict}</html>"
-    effects = [effect.name for effect in load_joint(out / "extended.joint2.yaml").effects]
+    effects = [effect.name for effect in load_joint(out / "extended.joint.yaml").effects]
     assert effects == (["coulomb_friction", "sensor_offset"] if verdict == "cause" else [])
 
 

@@ -52,7 +52,7 @@ def test_the_contract_s_keys_are_there_in_every_verdict() -> None:
             assert {"name", "joint", "class", "parameters", "evidence", "grade", "rivals", "given"} <= set(
                 each
             )
-            assert set(each["evidence"]) == {"delta_bic"}
+            assert set(each["evidence"]) == {"delta_bic", "held_out_gain"}
             assert all(set(p) == {"value", "ci95", "unit"} for p in each["parameters"].values())
 
 
@@ -166,6 +166,7 @@ def test_files_read_back_as_the_joints_meant(tmp_path: Path) -> None:
     names = write_extended(tmp_path, joints, made, **ORIGIN)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
     assert load_joint(tmp_path / "extended.joint2.yaml") == extended(joints[2], 2, made, **ORIGIN)
+    assert load_joint(tmp_path / "extended.joint.yaml") == load_joint(tmp_path / "extended.joint2.yaml")
     assert load_joint(tmp_path / "extended.joint1.yaml") == extended(joints[1], 1, made, **ORIGIN)
     text = (tmp_path / "extended.joint1.yaml").read_text()
     assert text.startswith(f"# {extended_title(1, made)}")
