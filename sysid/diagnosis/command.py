@@ -470,11 +470,7 @@ def extended_title(number: int, findings: Findings) -> str:
 def write_extended(
     directory: Path, joints: Mapping[int, Joint], findings: Findings, **origin: Any
 ) -> list[str]:
-    """Write the extended file of the joint with the largest cause (else gap), and of several joints one of each, too, into
-    `directory`; returns their names.
-
-    origin: sha256 and date of `extended`. Raises ConfigError.
-    """
+    """Write the extended file of the joint with the largest cause, and of several joints each; returns their names."""
     largest = [*(c.joint for c in findings.causes), *(g.joint for g in findings.gaps), *sorted(joints)]
     names = {EXTENDED: next(int(n) for n in largest if n in joints)}
     names |= {f"extended.joint{n}.yaml": n for n in sorted(joints) if len(joints) > 1}
