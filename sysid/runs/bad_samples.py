@@ -19,8 +19,9 @@ rest or not. A diagnosis leaves such rows out.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 from typing import Final
 
 import numpy as np
@@ -111,6 +112,70 @@ def on_a_cubic(at: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     ends = w * w * (1.0 + 2.0 * u) * y[k] + u * u * (1.0 + 2.0 * w) * y[k + 1]
     result: FloatArray = ends + h * u * w * (w * slope[k] - u * slope[k + 1])
     return result
+
+
+_EVEN: Final = 1e-6
+"""Part of a step by which steps differ by rounding."""
+_BESIDE: Final = 0, 1, 3, 4
+_SMOOTHER: Final = 0.98
+"""Part of the roughness over equal steps that positions have over the stamps, at most, where the samples were taken then."""
+_ROWS_AHEAD: Final = 4
+_FOLLOWED: Final = 0.05
+"""Part of a stamp's distance by which the phase of the cycles follows it: a clock drifts, jitter does not last."""
+
+
+def are_even(time_s: FloatArray) -> bool:
+    """Whether the steps between these times [n] are equal but for rounding."""
+    steps = np.diff(time_s)
+    median = float(np.median(steps))
+    return bool(np.max(np.abs(steps - median)) <= _EVEN * median)
+
+
+def row_times(time_s: FloatArray, positions: Sequence[FloatArray]) -> tuple[FloatArray, float, bool]:
+    """Return when the rows of these stamps were sampled [n], their usual step, and whether it is the stamps that jitter: as
+    stamped or whole steps apart, whichever leaves the positions smoother.
+    """
+    equal, step = _equal_steps(time_s, float(np.median(np.diff(time_s))))
+    jitters = _roughness(positions, time_s) >= _SMOOTHER * _roughness(positions, equal)
+    return equal if jitters else time_s, step, jitters
+
+
+def _equal_steps(time_s: FloatArray, step_s: float) -> tuple[FloatArray, float]:
+    """Return times of the rows [n] that are whole steps apart, and the step that ends where the stamps do.
+
+    A row belongs to a later cycle where it and the following rows are late against the mean phase of the rows before:
+    jitter makes one row late, a lost row all that follow.
+    """
+    ahead = np.min(
+        [np.append(time_s[k:], np.full(k, np.inf)) - k * step_s for k in range(_ROWS_AHEAD)], axis=0
+    )
+    cycles = np.zeros(len(time_s))
+    phase = float(time_s[0])
+    for row, (stamp, late) in enumerate(zip(time_s.tolist(), ahead.tolist(), strict=True)):
+        if row:
+            steps = max(1, round((late - phase) / step_s))
+            cycles[row] = cycles[row - 1] + steps
+            phase += steps * step_s
+            phase += _FOLLOWED * (stamp - phase)
+    step = float(time_s[-1] - time_s[0]) / float(cycles[-1])
+    return time_s[0] + step * cycles, step
+
+
+def _roughness(positions: Sequence[FloatArray], time_s: FloatArray) -> float:
+    """Return the geometric mean, over the positions that move, of the rms by which a value is off the cubic through its four
+    neighbours, with the rows at these times [n]; NaN without one.
+    """
+    n = len(time_s) - 4
+    near = np.column_stack([time_s[k : n + k] for k in _BESIDE]) - time_s[2:-2, None]
+    weights = np.ones_like(near)
+    for k, m in permutations(range(4), 2):  # Lagrange's, at 0
+        weights[:, k] *= near[:, m] / (near[:, m] - near[:, k])
+    moving = [x for x in positions if np.ptp(x) > 0.0]
+    beside = [np.column_stack([x[k : n + k] for k in _BESIDE]) for x in moving]
+    rough = [
+        float(np.std(x[2:-2] - np.sum(weights * b, axis=1))) for x, b in zip(moving, beside, strict=True)
+    ]
+    return math.exp(float(np.mean(np.log(rough)))) if rough and min(rough) > 0.0 else math.nan
 
 
 Limits = Mapping[str, Collection[float]]

@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
 from typing import Any, Final
 
 import numpy as np
@@ -25,7 +24,15 @@ from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.estimator.text import counted
-from jtqd.sysid.runs.bad_samples import Limits, check_held, on_a_cubic, saturation_limits, without_outliers
+from jtqd.sysid.runs.bad_samples import (
+    Limits,
+    are_even,
+    check_held,
+    on_a_cubic,
+    row_times,
+    saturation_limits,
+    without_outliers,
+)
 from jtqd.sysid.runs.channels import (
     MOTION,
     MOVING_RAD_S,
@@ -45,14 +52,6 @@ SLOWEST_HZ: Final = 50.0
 """Below it accelerations and reversals are not in the data, and ripple of slow motion is aliased."""
 _NOTED: Final = 0.05
 """Part of a step by which stamps are off equal steps, to be noted."""
-_EVEN: Final = 1e-6
-"""The same: less is rounding."""
-_NEIGHBOURS: Final = 0, 1, 3, 4
-_SMOOTHER: Final = 0.98
-"""Part of the roughness over equal steps that positions have over the stamps, at most, where the samples were taken then."""
-_ROWS_AHEAD: Final = 4
-_FOLLOWED: Final = 0.05
-"""Part of a stamp's distance by which the phase of the cycles follows it: a clock drifts, jitter does not last."""
 SKEW_NOTED_S: Final = 0.02
 """Less is left to the effect channel_delay."""
 SKEW_REFUSED_S: Final = 0.1
@@ -89,17 +88,17 @@ def on_even_steps(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]
     steps = np.diff(table.time_s)
     median = float(np.median(steps))
     apart = np.abs(steps - median)
-    if np.max(apart) <= _EVEN * median:
+    if are_even(table.time_s):
         return table, []
-    equal, step = _equal_steps(table.time_s, median)
-    jitters = _roughness(table, table.time_s) >= _SMOOTHER * _roughness(table, equal)
-    out = _resampled(table, equal if jitters else table.time_s, step)
+    positions = [getattr(columns, name) for columns in table.joints.values() for name in _POSITIONS]
+    rows, step, jitters = row_times(table.time_s, [x for x in positions if x is not None])
+    out = _resampled(table, rows, step)
     if np.max(apart) <= _NOTED * median:
         return table if jitters else out, []
     count, longest = int(np.count_nonzero(apart > _NOTED * median)), float(np.max(steps))
     off = f"off the median of {median:.4g} s by more than {_NOTED:.0%} (up to {longest:.4g} s)"
     found = f"{where}: time_s: found {count} of {len(steps)} steps {off}"
-    if not jitters or np.max(np.abs(table.time_s - equal)) <= _NOTED * median:
+    if not jitters or np.max(np.abs(table.time_s - rows)) <= _NOTED * median:
         return out, [RunIssue("time_uneven", f"{found}: resampled to equal steps")]
     text = f"{found}, but positions are smooth over equal steps: the stamps jitter, not the samples; equal steps used"
     return out, [RunIssue("time_jitter", text)]
@@ -113,45 +112,6 @@ def _resampled(table: RunTable, time_s: FloatArray, step_s: float) -> RunTable:
         for number, columns in table.joints.items()
     }
     return RunTable(grid, joints)
-
-
-def _equal_steps(time_s: FloatArray, step_s: float) -> tuple[FloatArray, float]:
-    """Return times of the rows [n] that are whole steps apart, and the step that ends where the stamps do.
-
-    A row belongs to a later cycle where it and the following rows are late against the mean phase of the rows before:
-    jitter makes one row late, a lost row all that follow.
-    """
-    ahead = np.min(
-        [np.append(time_s[k:], np.full(k, np.inf)) - k * step_s for k in range(_ROWS_AHEAD)], axis=0
-    )
-    cycles = np.zeros(len(time_s))
-    phase = float(time_s[0])
-    for row, (stamp, late) in enumerate(zip(time_s.tolist(), ahead.tolist(), strict=True)):
-        if row:
-            steps = max(1, round((late - phase) / step_s))
-            cycles[row] = cycles[row - 1] + steps
-            phase += steps * step_s
-            phase += _FOLLOWED * (stamp - phase)
-    step = float(time_s[-1] - time_s[0]) / float(cycles[-1])
-    return time_s[0] + step * cycles, step
-
-
-def _roughness(table: RunTable, time_s: FloatArray) -> float:
-    """Return the geometric mean, over the positions that move, of the rms by which a value is off the cubic through its four
-    neighbours, with the rows at these times [n]; NaN without one.
-    """
-    n = len(time_s) - 4
-    near = np.column_stack([time_s[k : n + k] for k in _NEIGHBOURS]) - time_s[2:-2, None]
-    weights = np.ones_like(near)
-    for k, m in permutations(range(4), 2):  # Lagrange's, at 0
-        weights[:, k] *= near[:, m] / (near[:, m] - near[:, k])
-    every = [getattr(columns, name) for columns in table.joints.values() for name in _POSITIONS]
-    moving = [x for x in every if x is not None and np.ptp(x) > 0.0]
-    beside = [np.column_stack([x[k : n + k] for k in _NEIGHBOURS]) for x in moving]
-    rough = [
-        float(np.std(x[2:-2] - np.sum(weights * b, axis=1))) for x, b in zip(moving, beside, strict=True)
-    ]
-    return math.exp(float(np.mean(np.log(rough)))) if rough and min(rough) > 0.0 else math.nan
 
 
 def unwrapped(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]]:

@@ -56,7 +56,7 @@ from jtqd.estimator.decoder import (
 from jtqd.estimator.errors import Verbatim, shown
 from jtqd.estimator.run import COLUMN_NAMES
 from jtqd.models.files import load_yaml
-from jtqd.sysid.runs.bad_samples import on_a_cubic, outlier_rows
+from jtqd.sysid.runs.bad_samples import are_even, on_a_cubic, outlier_rows, row_times
 
 LONGEST: Final = 1000
 DEEPEST: Final = 40
@@ -440,12 +440,18 @@ def motion_of(
     """Return velocity and acceleration [n] of the quintic through a window of the position around each row, ends held.
 
     The window is the shortest in which the position's noise is below `quiet` of the motion's largest acceleration, WINDOW_S
-    at most: a longer one rounds the reversals off. Rows are taken as even (Savitzky and Golay 1964, doi
-    10.1021/ac60214a047). Outlier samples are interpolated.
+    at most: a longer one rounds the reversals off (Savitzky and Golay 1964, doi 10.1021/ac60214a047); rows that are not
+    even are brought to equal steps and back. Outlier samples are interpolated.
     """
     outliers = outlier_rows(position, _OUTLIER_RAD)
     if outliers.any():
         position = on_a_cubic(time_s, time_s[~outliers], position[~outliers])
+    if not are_even(time_s):
+        rows, step, _ = row_times(time_s, [position])
+        even = np.arange(rows[0], rows[-1] + 1e-9, step)
+        found = motion_of(even, on_a_cubic(even, rows, position), quiet)
+        velocity, acceleration = (on_a_cubic(rows, even, x) for x in found)
+        return velocity, acceleration
     step = float(np.median(np.diff(time_s)))
     longest = min(max(_FEWEST_ROWS // 2, round(0.5 * WINDOW_S / step)), (len(position) - 1) // 2)
     if longest < 2:
