@@ -220,6 +220,7 @@ def frames_in_a_second(bus: str, *can_ids: int) -> list[int]:
 
 
 @pytest.mark.native
+@pytest.mark.measures
 def test_objects_of_the_makers_own() -> None:
     """Joint 1 by its drive's mA, counted backwards, and rpm; joint 2, with the same motion, by CiA 402."""
     objects = {
@@ -233,6 +234,7 @@ def test_objects_of_the_makers_own() -> None:
 
 
 @pytest.mark.native
+@pytest.mark.measures
 def test_one_encoder_no_velocity_and_torque_instead_of_current() -> None:
     """Drives that have none of 60E4h, 606Ch and their scaling; joint 1 by 6077h, counted backwards, joint 2 by 6078h."""
     less = {"link_position": False, "motor_velocity": False}
