@@ -27,12 +27,11 @@ test: style ## everything but the tests marked campaign
 	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part.
 	$(BIN)/python -m compileall -q daemon drivers estimator models sim_can sysid tests tools validation
 	@status=0; \
-	$(MAKE) --no-print-directory -k -j5 --output-sync=target test-guest test-native test-here test-hidden types || status=$$?; \
-	$(MAKE) --no-print-directory test-alone || status=$$?; \
+	$(MAKE) --no-print-directory -k -j4 --output-sync=target test-guest test-here test-hidden types || status=$$?; \
+	$(MAKE) --no-print-directory -k test-native test-alone || status=$$?; \
 	exit $$status
 
-# All lanes at once: the native one mostly waits and comes before those that compute, which share the processors to the end.
-# The bench kernel keeps a time of its own, so it feels none of them.
+# All lanes that keep no time of this machine at once; the bench kernel keeps a time of its own, so it feels none of them.
 BEHIND := nice -n 10
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 # In the lane of the guest, which is the shorter one.
@@ -51,11 +50,11 @@ test-hidden:
 test-guest: kernel-with-vcan
 	$(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign" $(call MARKED,socketcan|boots)
 
-# Processes at the pace of this machine's clock: most of the time they wait.
+# Processes at the pace of this machine's clock, whose inputs come in time: nothing beside them.
 test-native:
 	$(BIN)/python -m pytest $(SLOWEST) -m "native and not (measures or campaign or socketcan or boots)" $(call MARKED,native)
 
-# What they do within a time, or how often: nothing beside them.
+# The same, judged by how quick or how often something is.
 test-alone:
 	$(BIN)/python -m pytest $(SLOWEST) -m "measures and not (campaign or socketcan or boots)" $(call MARKED,measures)
 
