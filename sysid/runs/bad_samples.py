@@ -166,6 +166,8 @@ def _roughness(positions: Sequence[FloatArray], time_s: FloatArray) -> float:
     neighbours, with the rows at these times [n]; NaN without one.
     """
     n = len(time_s) - 4
+    if n < 1:
+        return math.nan
     near = np.column_stack([time_s[k : n + k] for k in _BESIDE]) - time_s[2:-2, None]
     weights = np.ones_like(near)
     for k, m in permutations(range(4), 2):  # Lagrange's, at 0

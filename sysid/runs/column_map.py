@@ -434,6 +434,10 @@ def targets() -> list[str]:
     return [TIME, *(f"j{joint}.{quantity}" for joint in JOINTS for quantity in COLUMN_NAMES)]
 
 
+_LONGEST_GAP: Final = 10.0
+"""Steps between two rows that the motion of a position is followed over."""
+
+
 def motion_of(
     time_s: FloatArray, position: FloatArray, quiet: float = QUIET
 ) -> tuple[FloatArray, FloatArray]:
@@ -448,6 +452,10 @@ def motion_of(
         position = on_a_cubic(time_s, time_s[~outliers], position[~outliers])
     if not are_even(time_s):
         rows, step, _ = row_times(time_s, [position])
+        short = np.minimum(
+            np.diff(rows), _LONGEST_GAP * step
+        )  # nothing is known of the motion in a longer one
+        rows = np.concatenate(([0.0], np.cumsum(short)))
         even = np.arange(rows[0], rows[-1] + 1e-9, step)
         found = motion_of(even, on_a_cubic(even, rows, position), quiet)
         velocity, acceleration = (on_a_cubic(rows, even, x) for x in found)

@@ -226,3 +226,17 @@ def test_the_acceleration_of_samples_that_jitter_is_as_of_even_ones() -> None:
         _, found = motion_of(t, q)
         errors.append(float(np.std((found + 4.0 * np.sin(t))[50:-50])))
     assert errors[1] < 1.2 * errors[0]
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 400])
+def test_the_motion_of_few_uneven_rows_and_over_a_clock_that_is_set_is_finite(count: int) -> None:
+    """A gap of years is no grid of years."""
+    t = 0.004 * np.arange(count) + 1e-4 * np.random.default_rng(9).normal(size=count)
+    swing = np.sin(3.0 * t)
+    t[count // 2 :] += 1e9
+    velocity, acceleration = motion_of(t, swing)
+    assert velocity.shape == acceleration.shape == (count,)
+    assert np.isfinite(velocity).all()
+    assert np.isfinite(acceleration).all()
+    if count > 100:
+        assert acceleration[60:140] == pytest.approx(-9.0 * swing[60:140], abs=0.5)
