@@ -219,8 +219,8 @@ def tpdos_of(
     return used
 
 
-LATCHED_BY_DEFAULT: Final = faults.NOT_FINITE | faults.BITS["motor_jump"] | faults.BITS["link_jump"]
-"""Faults after which numbers look right and are not: a broken estimator, an encoder that has lost its zero."""
+LATCHED_BY_DEFAULT: Final = sum(faults.BITS[a] for a in ("not_finite", "motor_jump", "link_jump", "repeated"))
+"""Faults after which numbers look right and are not: a broken estimator, an encoder that has lost its zero, old inputs."""
 LOOPBACK: Final = "lo"
 """Network interface that no other machine reaches."""
 HIGHEST_DOMAIN: Final = 232

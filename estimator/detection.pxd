@@ -1,5 +1,7 @@
 """Plausibility of the readings, torque rate, load of the link and contacts: parameters and states; detection.pyx."""
 
+from libc.stdint cimport uint8_t, uint64_t
+
 from jtqd.estimator.observer cimport FusedObserverLaw, FusedObserverState, Sample
 
 cdef enum: CONTACT_WAVES = 4  # cos and sin of 1 and 2 per turn of the motor
@@ -85,7 +87,15 @@ cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint
 cdef bint in_order(const InputState *s) noexcept nogil
 cdef void bound_inputs(InputState *s, double most) noexcept nogil
 
+cdef struct Samples:  # hashes of the last 256 samples, and where the last one with a hash stands, by its low byte
+    uint64_t words[256]
+    uint8_t at[256]
+    uint8_t next, lag  # lag: of the run that is followed, 0 for none
+    int run, unlike  # samples of it that differ from the one before them; samples that continued none, up to KNOWN_RUNS
+    double usual, weight  # mean length of runs; log(1 + 1/usual)
+
 cdef class Plausibility:
+    cdef Samples samples
     cdef double gap_s, per_turn, jump, limit, longest_frozen_s, twist_limit, twist_jump
     cdef double low, high, motor, twist, current, frozen_from, frozen_s
     cdef readonly double mismatch_rad

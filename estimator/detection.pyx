@@ -13,6 +13,13 @@
 | VELOCITY_MISMATCH | abs(mismatch) > mismatch_rad + LAG_S abs(omega_m) | frozen or reversed motor position, or velocity |
 | TORSION | abs(twist) > its limit | link encoder frozen, reversed or slipped; wrong gear ratio; motor encoder frozen |
 | CURRENT_FROZEN | the same current, not 0, for frozen_s while the motor turned by FROZEN_RAD | current or its PDO frozen |
+| REPEATED | samples, all four numbers, equal those of a fixed number of samples ago for longer than chance | they have come before: all later ones are as old |
+
+Noise does not come twice. A run of samples that equal those of `lag` samples ago (2 to 255; the last sample like this one sets the
+lag) is as long as chance makes it: geometric, of the mean length of KNOWN_RUNS. A sample that equals the last one proves nothing, and neither does a joint without noise,
+whose samples have come before from the start on.
+
+    run log(1 + 1/usual) > RARE
 
 Nothing is concluded from a value that stands still beside others that stand still: a joint at rest is no fault. The limit of
 the twist is what twice the largest believable torque does to the gear, and `twist_rad` for encoder errors: the
@@ -56,7 +63,8 @@ when the push ends; a step back is taken from a second trend, of e since the con
 """
 
 from libc.math cimport NAN, cos, fabs, isfinite, isnan, log1p, sin, sqrt
-from libc.string cimport memset
+from libc.stdint cimport uint8_t, uint64_t
+from libc.string cimport memcpy, memset
 
 from typing import Final
 
@@ -78,7 +86,44 @@ cdef double FROZEN = FROZEN_RAD
 cdef double LONGEST_STEP_S = 0.05  # differences over a longer step are not judged
 cdef double GAP_PERIODS = 5.0  # a longer step is a gap: its slip is acceleration that was not measured, and is not added up
 cdef int MOTOR_JUMP = st.MOTOR_JUMP, LINK_JUMP = st.LINK_JUMP, VELOCITY_MISMATCH = st.VELOCITY_MISMATCH
-cdef int TORSION = st.TORSION, CURRENT_FROZEN = st.CURRENT_FROZEN
+cdef int TORSION = st.TORSION, CURRENT_FROZEN = st.CURRENT_FROZEN, REPEATED = st.REPEATED
+cdef double RARE = 28.0  # logarithm of how rarely chance repeats so many samples: less than once in years
+cdef int KNOWN_RUNS = 64  # of equal samples, or samples unlike all before: their mean is known, and is a mean of so many
+cdef uint64_t ODD = 0x9E3779B97F4A7C15
+
+cdef inline uint64_t _mixed(uint64_t word, double value) noexcept nogil:
+    """Return a hash of all values so far."""
+    cdef uint64_t bits
+    memcpy(&bits, &value, sizeof(bits))
+    word = (word ^ bits) * ODD
+    return word ^ word >> 29
+
+
+cdef bint _repeats(Samples *s, uint64_t word) noexcept nogil:
+    """Take the hash of a sample; return whether the last ones are the same as earlier ones, by more than chance."""
+    cdef uint8_t k = s.next, slot = word & 0xFF, last = k - 1, seen, at, earlier
+    cdef bint differs = word != s.words[last]
+    s.next += 1
+    s.words[k] = word
+    if s.lag and word == s.words[<uint8_t> (k - s.lag)]:
+        s.run += differs
+    else:
+        if s.lag:
+            s.usual += (s.run - s.usual) / KNOWN_RUNS
+            s.weight = log1p(1.0 / max(s.usual, 1e-3))
+        s.unlike += differs and s.unlike < KNOWN_RUNS
+        seen = s.at[slot]
+        s.run, s.lag = 0, <uint8_t> (k - seen)
+        if not differs or seen == k or word != s.words[seen]:
+            s.lag = 0
+        else:  # another lag had been taken meanwhile: what equals before counts as well
+            at, earlier = last, <uint8_t> (seen - 1)
+            while earlier != k and s.words[at] == s.words[earlier]:
+                at -= 1
+                s.run += s.words[at] != s.words[<uint8_t> (at + 1)]
+                earlier -= 1
+    s.at[slot] = k
+    return s.run * s.weight > RARE and s.unlike == KNOWN_RUNS
 
 
 cdef class Plausibility:
@@ -104,6 +149,8 @@ cdef class Plausibility:
         self.motor = self.twist = self.current = self.frozen_from = NAN
         self.frozen_s = 0.0
         self.mismatch_rad = 0.0
+        memset(&self.samples, 0, sizeof(Samples))
+        self.samples.usual, self.samples.weight = 1.0, log1p(1.0)
 
     def step(
         self,
@@ -123,6 +170,8 @@ cdef class Plausibility:
         cdef double slip = motor_position - self.motor - motor_velocity * dt_s
         cdef double twist = motor_position * self.per_turn - link_position
         cdef double change = twist - self.twist
+        cdef uint64_t word = _mixed(_mixed(_mixed(_mixed(ODD, motor_position), link_position), motor_velocity), current)
+        cdef bint repeats = _repeats(&self.samples, word)
         self.mismatch_rad = self.mismatch_rad * (1.0 - dt_s * FORGET_RATE) + slip
         self.motor = motor_position
         self.twist = twist
@@ -139,9 +188,10 @@ cdef class Plausibility:
             and -self.twist_jump < change < self.twist_jump
             and 0.0 < dt_s < self.gap_s
             and self.frozen_s < self.longest_frozen_s
+            and not repeats
         ):
             return 0
-        return self.faults(dt_s, slip, motor_velocity, change)
+        return self.faults(dt_s, slip, motor_velocity, change) | (REPEATED if repeats else 0)
 
     cdef int faults(self, double dt_s, double slip, double velocity, double change) noexcept nogil:
         """Return the faults of a sample that is not clearly good: starts, gaps, long constant currents, faults."""
@@ -186,7 +236,6 @@ cdef double SETTLE_RATE = 1.0 / 0.03  # of the filters behind: doubt fades with 
 cdef double STRANGE_S = 0.5, UNKNOWN_RATE = 1.0 / 0.05
 cdef double STRANGE = 20.0  # samples out of order, of the last STRANGE_S: the sum of their steps is no displacement
 cdef double MOST = 100.0  # rated torques: no doubt is larger
-cdef int KNOWN_RUNS = 64  # of equal samples: their mean is known, and is a mean of so many
 cdef double UNSEEN = 2.5, LONGER = 4.0  # tolerances, samples: beyond what healthy inputs come to
 cdef double CALM = 0.1  # samples out of order, of the last STRANGE_S
 cdef double FOLLOW_RATE = 50.0  # at which the torque follows the current

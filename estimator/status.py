@@ -36,6 +36,7 @@ LINK_JUMP: Final = 0x08
 VELOCITY_MISMATCH: Final = 0x10
 TORSION: Final = 0x20
 CURRENT_FROZEN: Final = 0x40
+REPEATED: Final = 0x400
 """Bits of faults that `jtqd.estimator.detection` finds."""
 
 CONTACT_OFF, CONTACT_UNKNOWN, CONTACT_NONE, CONTACT_PRESENT = range(4)

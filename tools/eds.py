@@ -363,7 +363,7 @@ def jtqd_node(room: int = ROOM[0]) -> Sheet:
     note = [
         "2100h in 0.01 Nm, 8000h: no estimate. 2101h in 0.05 Nm, 255: more or unknown.",
         "2104h: bits 0 not finite, 1 out of range, 2 motor jump, 3 link jump, 4 velocity mismatch,",
-        "5 torsion, 6 current frozen, 7 deviation, 8 drive fault, 9 stale. 2110h: 1 releases them.",
+        "5 torsion, 6 current frozen, 7 deviation, 8 drive fault, 9 stale, 10 repeated. 2110h: 1 releases them.",
         "2106h in 32 Nm/s, 80h: no rate. 2107h: 0 not watched, 1 unknown, 2 none, 3 positive, 4 negative.",
         "1802h:1 (and 1803h:1) valid where contacts are sent.",
         "2205h:1 0 error active, 1 warning, 2 passive, 3 bus-off, 4 interface down.",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION, VELOCITY_MISMATCH
+from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, REPEATED, TORSION, VELOCITY_MISMATCH
 
 NOT_FINITE: Final = 0x01
 """The estimator gave a number that is none, or a sigma that is none, as if it were good."""
@@ -27,6 +27,7 @@ NAMES: Final = {
     DEVIATION: "deviation",
     DRIVE_FAULT: "drive_fault",
     STALE: "stale",
+    REPEATED: "repeated",
 }
 """Name by bit: in the configuration, in the counters (`fault_NAME`) and in lines for the operator."""
 BITS: Final = {name: bit for bit, name in NAMES.items()}
@@ -45,6 +46,7 @@ MEANINGS: Final = {
     DEVIATION: "the deviation from the torque sensor exceeded its limit",
     DRIVE_FAULT: "the drive was in fault",
     STALE: "too many consecutive cycles without a torque",
+    REPEATED: "the inputs had come before, so that those since then are old",
 }
 
 

@@ -28,6 +28,7 @@ from jtqd.estimator.status import (
     CURRENT_FROZEN,
     LINK_JUMP,
     MOTOR_JUMP,
+    REPEATED,
     TORSION,
     VELOCITY_MISMATCH,
 )
@@ -141,6 +142,33 @@ def test_all_of_it_frozen_at_rest_is_no_fault() -> None:
     """A joint that stands still for an hour: not one digit changes, and nothing is concluded from that."""
     check = checks()
     assert {check.step(PERIOD_S, 5.0, 0.0, 0.05, 0.7) for _ in range(200_000)} == {0}
+
+
+def _noisy(count: int, counts: float, seed: int) -> list[tuple[float, float, float, float]]:
+    """Return (motor position, velocity, link position, current) of a joint at rest, each with noise, in its counts."""
+    drawn = np.round(np.random.default_rng(seed).normal(0.0, counts, (count, 4)))
+    return [tuple(row) for row in (drawn * (1e-4, 1e-4, 1e-5, 8e-3)).tolist()]
+
+
+@pytest.mark.parametrize("counts", [0.3, 0.6, 1.5, 6.0])
+def test_noise_that_comes_twice_is_found_and_its_chance_is_not(counts: float) -> None:
+    """Numbers of few counts come again by chance; 60 samples in their order do not, whatever the delay."""
+    check, rows = checks(), _noisy(20_000, counts, 5)
+    assert {check.step(PERIOD_S, *row) for row in rows} == {0}
+    for delay in (100, 250):
+        check.reset()
+        check.step(PERIOD_S, *rows[0])
+        late = rows[1:1000] + rows[1000 - delay : 1000]
+        found = [check.step(PERIOD_S, *row) for row in late]
+        assert set(found[:999]) == {0}
+        assert REPEATED in found[999 : 999 + 60]
+
+
+def test_a_repetition_is_told_by_its_samples_and_not_by_those_that_stand_still() -> None:
+    """A joint without noise repeats one sample for ever, or two by turns: nothing is concluded from either."""
+    check = checks()
+    rows = _noisy(2, 2.0, 1)
+    assert {check.step(PERIOD_S, *rows[n // 7 % 2]) for n in range(20_000)} == {0}
 
 
 def test_no_current_at_all_while_the_motor_is_turned_is_no_fault() -> None:
