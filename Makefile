@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo hidden-effect docs deb release test test-here test-hidden test-guest test-native test-alone test-sanitized test-all mutants bench bench-kernel kernel-with-vcan fuzz soak soak-exact lint style types format clean
+.PHONY: help setup demo hidden-effect docs deb release test test-here test-sysid test-hidden test-guest test-native test-alone test-sanitized test-all mutants bench bench-kernel kernel-with-vcan fuzz soak soak-exact lint style types format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -27,14 +27,14 @@ test: style ## everything but the tests marked campaign
 	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part.
 	$(BIN)/python -m compileall -q daemon drivers estimator models sim_can sysid tests tools validation
 	@status=0; \
-	$(MAKE) --no-print-directory -k -j4 --output-sync=target test-guest test-here test-hidden types || status=$$?; \
+	$(MAKE) --no-print-directory -k -j5 --output-sync=target test-guest test-sysid test-hidden test-here types || status=$$?; \
 	$(MAKE) --no-print-directory -k test-native test-alone || status=$$?; \
 	exit $$status
 
 # All lanes that keep no time of this machine at once; the bench kernel keeps a time of its own, so it feels none of them.
 BEHIND := nice -n 10
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
-# In the lane of the guest, which is the shorter one.
+# What takes the processor for about as long as the rest of sysid, and as all else.
 HIDDEN := tests/validation tests/examples tests/sysid/batch
 HERE := not (campaign or socketcan or boots or native)
 SLOWEST := --durations=20 --durations-min=2
@@ -42,7 +42,10 @@ SLOWEST := --durations=20 --durations-min=2
 MARKED = $(shell grep -rlE --include='test_*.py' 'mark\.($(1))\b' tests | sort)
 
 test-here:
-	$(ONE_THREAD) $(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN:%=--ignore=%)
+	$(ONE_THREAD) $(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN:%=--ignore=%) --ignore=tests/sysid
+
+test-sysid:
+	$(ONE_THREAD) $(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN:%=--ignore=%) tests/sysid
 
 test-hidden:
 	$(ONE_THREAD) $(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN)
