@@ -14,14 +14,16 @@ import yaml
 from examples.own_rig import DATA_SHEET, TRUE
 from examples.own_rig import main as own_rig
 from jtqd.daemon.jtq import main as jtq
+from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.simulators import mjcf, model_of
 from tests.daemon.logs.campaign_log import Cycle, write_log
 from tests.daemon.logs.campaign_log import Joint as LogJoint
 from tests.paths import ROOT
-from tests.sysid.diagnosis.diagnose_helpers import bench_run
+from tests.sysid.diagnosis.diagnose_core_helpers import rigid_run
 from tests.sysid.simulators.mujoco_rig import free_run_error
 
 pytest.importorskip("matplotlib")
@@ -32,13 +34,26 @@ COMMANDS = re.findall(r"^    ((?:jtq|python -m) .*)$", PAGE, re.MULTILINE)
 MAPS = re.findall(r"^    ((?:time_s|j\d\.\w+): .*)$", PAGE, re.MULTILINE)
 
 
+def without_efficiency(number: int) -> Joint:
+    """The shipped joint whose losses are its friction, by which `rigid_run` computes."""
+    return replace(load_joint(shipped(f"joint{number}.yaml")), efficiency=None)
+
+
 def logs(folder: Path) -> None:
-    """Two logs of jtqd on the emulated bench's equations; each has lost 0.3 s."""
+    """Two logs of jtqd of joints that are as their files say; each has lost 0.3 s."""
     folder.mkdir()
     for number, phase in enumerate((0.0, 0.9), 1):
         sides = [
-            bench_run(load_joint(shipped(f"joint{n}.yaml")), 6.0, phase, numbers=(n,)).joints[n]
-            for n in (1, 2)
+            rigid_run(
+                joint,
+                phase,
+                step_s=2e-3,
+                noise=0.05,
+                stribeck_nm=joint.friction.stribeck_nm,
+                stribeck_velocity_rad_s=joint.friction.stribeck_velocity_rad_s,
+                damping_nms_per_rad=joint.damping_nms_per_rad,
+            ).joints[1]
+            for joint in map(without_efficiency, (1, 2))
         ]
         columns = [replace(c, torque_nm=sides[0].torque_nm) for c in sides]
         cycles = []
@@ -70,7 +85,12 @@ def logs(folder: Path) -> None:
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where all commands have been run: a directory with what the page takes for given, the models and logs of jtqd."""
     folder = tmp_path_factory.mktemp("your_data")
-    (folder / "models").symlink_to(ROOT / "models")
+    (folder / "models").mkdir()
+    (folder / "models" / "kinova_gen3").symlink_to(ROOT / "models" / "kinova_gen3")
+    for number in (1, 2):
+        write_joint(
+            folder / "models" / f"joint{number}.yaml", without_efficiency(number), "Its losses are friction."
+        )
     logs(folder / "logs")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -117,6 +137,13 @@ def test_the_rig_is_found_as_it_is(place: Path) -> None:
     assert len(found["causes"]) == 2
     assert any("2 segments of one recording" in note for note in found["channel_notes"])
     assert any("taken as true" in note for note in found["channel_notes"])
+
+
+def test_logs_of_joints_that_are_as_their_files_have_no_gap(place: Path) -> None:
+    found = json.loads((place / "diagnosis_logs" / "findings.json").read_text())
+    (group,) = json.loads((place / "fleet_diagnosis" / "summary.json").read_text())["groups"]
+    assert found["joints"] == [1, 2]
+    assert found["verdict"] == group["figures"]["verdict"] == "no_gap"
 
 
 def test_with_no_torque_known_the_values_are_found_as_they_are(place: Path) -> None:

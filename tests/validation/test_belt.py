@@ -34,7 +34,7 @@ from validation.generator.belt import (
     without,
 )
 
-FINE = tuple(Recording(motion, 3, 5.0, 1000.0, 12) for motion in ("multisine", "ladder", "creep"))
+FINE = tuple(Recording(motion, 3, 3.5, 1000.0, 12) for motion in ("multisine", "ladder", "creep"))
 VARIED = ("nonlinear_stiffness", "sensor_drift", "sensor_crosstalk", "encoder_eccentricity", "channel_delay")
 
 
