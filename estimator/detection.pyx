@@ -15,9 +15,8 @@
 | CURRENT_FROZEN | the same current, not 0, for frozen_s while the motor turned by FROZEN_RAD | current or its PDO frozen |
 | REPEATED | samples, all four numbers, equal those of a fixed number of samples ago for longer than chance | they have come before: all later ones are as old |
 
-Noise does not come twice. A run of samples that equal those of `lag` samples ago (2 to 255; the last sample like this one sets the
-lag) is as long as chance makes it: geometric, of the mean length of KNOWN_RUNS. A sample that equals the last one proves nothing, and neither does a joint without noise,
-whose samples have come before from the start on.
+Noise does not come twice. A run of samples equal to those of `lag` samples ago (2 to 255) is as long as chance makes it: geometric,
+of the mean length of KNOWN_RUNS. A sample equal to the last one, or without noise from the start on, is no proof.
 
     run log(1 + 1/usual) > RARE
 

@@ -520,7 +520,7 @@ cdef class FusedEstimator(Estimator):
         degraded = self.inconsistent(&physics, x.dt_s)
         if out.status == VALID:
             bound_inputs(&s.inputs, possible_error(&physics))
-        prove(&law.proof, &s.proof, &physics, seen, x.dt_s, standing, in_order(&s.inputs))
+        unproven = prove(&law.proof, &s.proof, &physics, seen, x.dt_s, standing, in_order(&s.inputs))
         if law.offsets.estimated:
             keep_offsets(&s.checkpoint, &s.offsets, in_order(&s.inputs), x.dt_s)
             self.update_path_difference(seen, x, &physics, loss.nm, out.status)
@@ -574,7 +574,7 @@ cdef class FusedEstimator(Estimator):
             variance = self.half_interval(seen, &physics, loss.half, more, sqrt(variance)) ** 2
         if law.tracked and out.status != STANDSTILL:  # measured in motion; of the torsion, by its share
             variance += share * (law.tracking_noise + law.tracking_viscous * v * v / (1.0 + law.tracking_bend * v * v))
-        unproven = unproven_nm2(&law.proof, &s.proof, best.alpha, s.offsets.link_rad, seen.ahead_nm)
+        unproven = unproven_nm2(&law.proof, unproven, best.alpha, s.offsets.link_rad, seen.ahead_nm)
         out.sigma_nm = sqrt(variance + unproven + s.inputs.doubt * s.inputs.doubt)
         publish_within(out, law.limit)
 

@@ -39,12 +39,10 @@ cdef struct ProofState:
 cdef double possible_error(const Fused *fused) noexcept nogil
 cdef int fill_proof(ProofLaw *law, double rated_nm, fused) except -1
 cdef void restart_proof(const ProofLaw *law, ProofState *s) noexcept nogil
-cdef void prove(
+cdef double prove(
     const ProofLaw *law, ProofState *s, const Fused *fused, const FusedObserved *seen, double dt, bint standing, bint in_order
 ) noexcept nogil
-cdef double unproven_nm2(
-    const ProofLaw *law, const ProofState *s, double alpha, double link_rad, double ahead_nm
-) noexcept nogil
+cdef double unproven_nm2(const ProofLaw *law, double unproven, double alpha, double link_rad, double ahead_nm) noexcept nogil
 
 cdef class Fusion:
     cdef FusionLaw law

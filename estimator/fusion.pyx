@@ -24,7 +24,7 @@ torsion may be off by, a bound of 3 standard deviations in sigma:
     U <= |tau_t - tau_c| + half + BOUNDING sqrt(s_c^2 + s_t^2)         at every sample
     U' = -U/PROVING_S                                                  where the paths agree and friction is one-sided
     U >= |tau_t - tau_c|                                               where they disagree
-    U >= min(range of tau_t, range of tau_t - tau_raw) - tolerance     at rest: the torsion changed, and the current did not
+    U >= min(range of tau_t, range of tau_t - tau_raw) > tolerance     at rest: the torsion changed, and the current did not
 
 An offset of the link encoder that is beyond DAYS spreads of ordinary days may be one of the current: it counts like U. What the
 torsion has changed by since the sample that the current path is as old as is not compared yet: AHEAD of it counts.
@@ -245,33 +245,36 @@ cdef void _move(ProofState *s) noexcept nogil:
     s.high = s.torsion_high = -INFINITY
 
 
-cdef void prove(
+cdef double prove(
     const ProofLaw *law, ProofState *s, const Fused *fused, const FusedObserved *seen, double dt, bint standing, bint in_order
 ) noexcept nogil:
-    """Take a sample into what the torsion may be off by; in_order: of the readings."""
-    cdef double balance = seen.torsion_nm - seen.raw_nm
+    """Take a sample; return what the torsion may be off by [Nm]; in_order: of the readings."""
+    cdef double balance = seen.torsion_nm - seen.raw_nm, torsion = seen.torsion_nm, most, now = 0.0
     if standing:
         s.low, s.high = fmin(s.low, balance), fmax(s.high, balance)
-        s.torsion_low, s.torsion_high = fmin(s.torsion_low, seen.torsion_nm), fmax(s.torsion_high, seen.torsion_nm)
-        s.unproven = fmax(s.unproven, fmin(s.high - s.low, s.torsion_high - s.torsion_low) - law.tolerance)
+        s.torsion_low, s.torsion_high = fmin(s.torsion_low, torsion), fmax(s.torsion_high, torsion)
+        now = fmin(s.high - s.low, s.torsion_high - s.torsion_low)
+        s.unproven = fmax(s.unproven, now if now > law.tolerance else 0.0)
+        balance, torsion = balance + seen.ahead_nm, torsion + seen.ahead_nm
+        now = fmin(fmax(s.high, balance) - fmin(s.low, balance), fmax(s.torsion_high, torsion) - fmin(s.torsion_low, torsion))
     else:
         _move(s)
     if fabs(fused.difference) > reach(fused, DISAGREE):
         s.unproven = fmax(s.unproven, fabs(fused.difference))
     elif fabs(seen.direction) > ONE_SIDED and in_order and not standing:
         s.unproven *= PROVING_S / (PROVING_S + dt)
-    s.unproven = fmin(s.unproven, fmin(law.most, possible_error(fused)))
+    most = fmin(law.most, possible_error(fused))
+    s.unproven = fmin(s.unproven, most)
+    return fmax(s.unproven, fmin(now, most + fabs(seen.ahead_nm))) if now > law.tolerance else s.unproven
 
 
-cdef double unproven_nm2(
-    const ProofLaw *law, const ProofState *s, double alpha, double link_rad, double ahead_nm
-) noexcept nogil:
+cdef double unproven_nm2(const ProofLaw *law, double unproven, double alpha, double link_rad, double ahead_nm) noexcept nogil:
     """Return what is not proven as an addition to sigma^2 [Nm^2] of a value with this share of the torsion.
 
-    link_rad: correction of the link encoder; ahead_nm: change of the torsion that the current path has not seen.
+    unproven: as `prove`; link_rad: correction of the link encoder; ahead_nm: change of the torsion unseen by the current path.
     """
     cdef double learned = law.stiffness * link_rad, ahead = AHEAD * ahead_nm
-    return alpha * alpha * (s.unproven * s.unproven + fmax(learned * learned - law.day, 0.0)) * PER_BOUND + ahead * ahead
+    return alpha * alpha * (unproven * unproven + fmax(learned * learned - law.day, 0.0)) * PER_BOUND + ahead * ahead
 
 
 class FusedPaths(NamedTuple):
@@ -938,7 +941,7 @@ def track_run(
     cdef AgreementLaw levels_law
     cdef AgreementState agreement
     cdef Fused physics
-    cdef double raw, torsion, difference, known
+    cdef double raw, torsion, difference, known, unproven
     cdef Py_ssize_t k
     fill_fusion(&paths, fused.sigma, True)
     paths.reference = 0.0
@@ -953,8 +956,8 @@ def track_run(
         to[1, k], to[2, k] = x[k, 9] * s.link_rad, -(1.0 - x[k, 8]) * s.current_a
         raw, torsion, difference = x[k, 1] - s.current_a, x[k, 4] + to[1, k], x[k, 6] + to[1, k] - to[2, k]
         physics = fuse_paths(&paths, raw, raw - torsion + difference, x[k, 2], x[k, 3], torsion, x[k, 5])
-        seen.raw_nm, seen.torsion_nm, seen.direction = raw, torsion, x[k, 7]
-        prove(&proof_law, &proof, &physics, &seen, x[k, 0], rests[k], True)
+        seen.raw_nm, seen.torsion_nm, seen.direction, seen.ahead_nm = raw, torsion, x[k, 7], x[k, 10]
+        unproven = prove(&proof_law, &proof, &physics, &seen, x[k, 0], rests[k], True)
         if rests[k]:
             drop_block(&s)
         elif gather(&s, x[k, 0], difference, x[k, 7], x[k, 3], torsion, physics.variance - law.spread_nm):
@@ -964,7 +967,7 @@ def track_run(
             reweigh(&physics, known)
         to[0, k], to[3, k], to[5, k] = physics.alpha, physics.sigma * early_factor(&law, known), known
         to[4, k] = apart_nm2(&physics, 0.0 if levels_law.used else s.uncorrected_nm)
-        to[4, k] += unproven_nm2(&proof_law, &proof, physics.alpha, s.link_rad, x[k, 10])
+        to[4, k] += unproven_nm2(&proof_law, unproven, physics.alpha, s.link_rad, x[k, 10])
         if levels_law.used:
             to[4, k] += mismatch_variance(&agreement, physics.alpha, torsion)
     return tuple(out)

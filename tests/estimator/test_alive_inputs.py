@@ -70,8 +70,8 @@ def held(found: EstimateRun, at: slice) -> bool:
 def unproven_nm2(given: Inputs) -> tuple[slice, FloatArray]:
     """Last rest, and what sigma^2 has there of the torsion that nothing has proven [n]: (share U/3)^2 + (ahead/20)^2.
 
-    U: range of the torsion since the stop, or of the torsion less the motor's torque where that is less, beyond 2.5 % of the
-    rated torque; at most what the current path allows.
+    U: range of the torsion since the stop, or of the torsion less the motor's torque where that is less, if it is above
+    2.5 % of the rated torque; at most what the current path allows; at each sample with what the torsion is ahead by.
     """
     fused, n = JOINT.fused, len(given.true_nm)
     assert fused is not None
@@ -83,18 +83,23 @@ def unproven_nm2(given: Inputs) -> tuple[slice, FloatArray]:
         x[rest] for x in (seen.raw_nm, seen.velocity_rad_s, seen.torsion_nm, seen.direction, seen.ahead_nm)
     )
 
-    def ranged(values: FloatArray) -> FloatArray:
-        return np.asarray(np.maximum.accumulate(values) - np.minimum.accumulate(values))
+    def ranged(values: FloatArray, beyond: FloatArray | float = 0.0) -> FloatArray:
+        high, low = np.maximum.accumulate(values), np.minimum.accumulate(values)
+        return np.asarray(np.maximum(high, values + beyond) - np.minimum(low, values + beyond))
 
-    lasting = np.minimum(ranged(torsion), ranged(torsion - raw)) - 0.025 * RATED
+    def least(beyond: FloatArray | float = 0.0) -> FloatArray:
+        changed = np.minimum(ranged(torsion, beyond), ranged(torsion - raw, beyond))
+        return np.where(changed > 0.025 * RATED, changed, 0.0)
+
     loss, half = AdditiveLossModel(fused.loss).loss_many(raw, v, np.full(len(raw), 25.0), direction)
     paths = Fusion(replace(fused.sigma, reference_nm=0.0), True).fuse(
         raw, half, v, torsion, seen.open_nm[rest]
     )
     most = np.abs(torsion - (raw - loss)) + half + 3.0 * np.sqrt(paths.variance_nm2 - half**2)
-    off = np.maximum(0.0, lasting)
+    off = least()
     for k in range(1, len(off)):
         off[k] = min(max(off[k - 1], off[k]), most[k])
+    off = np.maximum(off, np.minimum(least(ahead), most + np.abs(ahead)))
     return rest, (paths.alpha * off / 3.0) ** 2 + (0.05 * ahead) ** 2
 
 
