@@ -50,8 +50,9 @@ test-sysid:
 test-hidden:
 	$(ONE_THREAD) $(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN)
 
+# The longest lane: a turn of the processor that it misses is time at the end with one core at work.
 test-guest: kernel-with-vcan
-	$(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign" $(call MARKED,socketcan|boots)
+	nice -n 5 $(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign" $(call MARKED,socketcan|boots)
 
 # Processes at the pace of this machine's clock, whose inputs come in time: nothing beside them.
 test-native:
