@@ -21,8 +21,6 @@ from tests.daemon.recording.recorder_bench import (
     session_on,
 )
 
-pytestmark = pytest.mark.native
-
 EVENT = DEFINITIONS["jtqd_msgs/msg/Event"].constants
 STATUS = DEFINITIONS["jtqd_msgs/msg/JointEstimate"].constants
 NS = 1_000_000
@@ -140,6 +138,7 @@ def recorder(tmp_path):
     process.kill()
 
 
+@pytest.mark.native
 @pytest.mark.parametrize(
     ("number", "reason"), [(signal.SIGUSR1, "on request"), (signal.SIGUSR2, "the loop failed")]
 )
@@ -156,6 +155,7 @@ def test_signal(recorder, number, reason):
     assert metadata_of(summary["path"])["reason"] == reason
 
 
+@pytest.mark.native
 def test_nothing_happened(recorder):
     recorder.paced(0, 1500, 2000)
     status, summary, errors = recorder.end()
@@ -164,6 +164,7 @@ def test_nothing_happened(recorder):
     assert not recorder.output.exists()
 
 
+@pytest.mark.native
 def test_parent_that_goes_away_is_a_fault(tmp_path):
     process = RecorderProcess(tmp_path, flight_recorder_s=5.0)  # for its ring and request
     process.wait_until_ready()
