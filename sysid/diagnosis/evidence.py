@@ -3,7 +3,8 @@
     y_r = X beta + F (w + v_r) + Z_r u_r + e_r        per balance, binned, e noise (`regressors`)
 
 X: columns of the entries, scaled so that beta ~ N(0, 1) for entries in the set and 0 for all others; a set has prior odds.
-F: eigenfunctions over the conditions (`regressors.features`): what no library holds; w shared by all runs, v_r a run's own.
+F: eigenfunctions over the conditions, and rates of the load (`regressors.features`): what no library holds; w shared by
+all runs, v_r a run's own.
 Z: what a run has of its own (`regressors.families`; Laird and Ware 1982, Biometrics 38). The variances of w, v and u are
 where the marginal likelihood is largest (MacKay 1992, Neural Computation 4). Given them everything is linear and Gaussian,
 and the evidence of any set follows from one matrix of normal equations (George and McCulloch 1993, J. Am. Stat.
@@ -310,7 +311,8 @@ class Equations:
     """Whitened normal equations of all recordings over [entries' columns E | nuisances N | response].
 
     grams: per recording; noise: what the noise of torques puts into them; groups: of the variance of each nuisance; shared:
-    which nuisances are discrepancy, with a part that all runs have in common.
+    which nuisances are discrepancy, with a part that all runs have in common. Columns that are noise for the most part, as a
+    rate of a noisy torque is, make no entry (`noisy`) and no nuisance.
     """
 
     def __init__(  # noqa: PLR0917
@@ -329,7 +331,7 @@ class Equations:
         self.entries, self.groups, self.shared = list(entries), groups, shared
         self.resemblance = resemblance
         self.recorded = np.zeros(sum(e.size for e in entries)) if recorded is None else recorded
-        self.plain, self.noise = grams, noise
+        self.plain, self.noise = grams.copy(), noise.copy()
         self.start, self.most = start, most
         self.E, self.N = sum(e.size for e in entries), len(groups)
         self.kinds = sorted(set(groups), key=str)
@@ -338,17 +340,16 @@ class Equations:
         self._outer = np.concatenate((np.arange(self.E), self.E + shared, [self.E + self.N])).astype(np.intp)
         sides = np.append(np.arange(self.E), self.E + self.N)
         self.scatter = Scatter(noise.sum(axis=0)[np.ix_(sides, sides)], rows)
-        self.noisy = self._noisy()
+        signal, much = (np.einsum("rii->i", g) for g in (grams, noise))
+        much = much > _NOISY * signal
+        self.noisy = frozenset(k for k, s in enumerate(slices_of(entries)) if much[s].any())
+        blind = self.E + np.flatnonzero(much[self.E : -1])
+        for g in (self.plain, self.noise):
+            g[:, blind], g[:, :, blind] = 0.0, 0.0
         self.kappa = 1.0
-        self.grams = grams
+        self.grams = self.plain
         self.turned = np.empty((0, len(shared)))
         self._take_out(1.0)
-
-    def _noisy(self) -> Set:
-        """Return the entries whose columns are noise for the most part, as a rate of a noisy torque is."""
-        signal, noise = (np.einsum("rii->i", g)[: self.E] for g in (self.plain, self.noise))
-        much = noise > _NOISY * signal
-        return frozenset(k for k, s in enumerate(slices_of(self.entries)) if much[s].any())
 
     def _take_out(self, kappa: float) -> None:
         self.kappa = kappa

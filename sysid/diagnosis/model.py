@@ -239,7 +239,7 @@ class _Work:
         self.most: dict[object, float] = {}
         shared: list[int] = []
         for channel in dataset.runs[0].channels:
-            made = features(dataset.runs, channel, rng)
+            made = features(dataset.runs, channel, rng, self.disturbed)
             first, count = len(self.groups), made[0].shape[1]
             group = ("discrepancy", channel)
             self.groups += [group] * count
@@ -249,7 +249,7 @@ class _Work:
             )
             self.most[group] = limits.CAP**2 * float(np.mean(gap**2)) if len(gap) else 1.0
             shared += range(first, first + count)
-            for r, run in enumerate(self.runs):
+            for r, run in enumerate((*self.runs, *self.disturbed)):
                 d = run.channels[channel]
                 run.channels[channel] = replace(
                     d,
@@ -500,15 +500,12 @@ def _difference(other: RunData, run: RunData) -> RunData:
     channels = {}
     for c, d in other.channels.items():
         mine = run.channels[c]
-        nuisances = np.zeros_like(mine.nuisances)
-        own = d.nuisances.shape[1]
-        nuisances[:, :own] = d.nuisances - mine.nuisances[:, :own]
         channels[c] = ChannelData(
             mine.valid,
             d.residual - mine.residual,
             d.regressors - mine.regressors,
             mine.index,
-            nuisances,
+            d.nuisances - mine.nuisances,
             mine.families,
         )
     return replace(run, channels=channels)

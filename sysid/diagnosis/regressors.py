@@ -385,8 +385,10 @@ def basis_columns(
 
 
 def _axes(s: JointSignals, samples: float) -> dict[str, FloatArray]:
-    """Return the operating conditions, binned; angles unwrapped."""
-    return {axis: binned(getattr(s.state, name), samples) for axis, name in _AXES.items()}
+    """Return the operating conditions, binned; angles unwrapped. Rates of the load [Nm/s, Nm/s^2] as columns are seen."""
+    rates = [(1, s.state.torque_rate_nm_s), (2, second_difference(s.state.torque_nm, s.state.time_s))]
+    of_load = dict(zip(_RATES, seen_in_bins(s, rates, samples)[1].T, strict=True))
+    return {axis: binned(getattr(s.state, name), samples) for axis, name in _AXES.items()} | of_load
 
 
 def gain_columns(candidates: Sequence[EffectCandidate]) -> set[int]:
@@ -395,22 +397,28 @@ def gain_columns(candidates: Sequence[EffectCandidate]) -> set[int]:
 
 
 _CONDITIONS: Final = ("velocity", "load", "link_angle")
+_RATES: Final = ("load_rate", "load_second_rate")
 _POINTS: Final = 200
 """Of the conditions, at which the eigenfunctions are found."""
 
 
-def features(runs: Sequence[RunData], channel: Channel, rng: np.random.Generator) -> list[FloatArray]:
-    """Return the features of the discrepancy of one balance per run [n, k]: their squares add up to 1 Nm^2 in the mean.
+def features(
+    runs: Sequence[RunData], channel: Channel, rng: np.random.Generator, disturbed: Sequence[RunData] = ()
+) -> list[FloatArray]:
+    """Return the features of the discrepancy of one balance per run and disturbed run [n, k]: their squares add up to 1 Nm^2
+    in the mean over the runs.
 
     The discrepancy is what the library does not hold: a Gaussian process over speed, load and angle, plain and, in the motor
     balance, in the direction of motion, as friction is; Matern 3/2, because friction has kinks. The features are its largest
-    eigenfunctions over the conditions of the runs (Nystrom approximation: Williams and Seeger 2001, NIPS 13).
+    eigenfunctions over the conditions of the runs (Nystrom approximation: Williams and Seeger 2001, NIPS 13). What frame,
+    gear and recorder answer with delay is, to the second order of the frequency, a part of the load's first two rates; each
+    is a feature as large as the others are in the mean.
     """
-    axes = [run.axes[channel.joint] for run in runs]
+    axes = [run.axes[channel.joint] for run in (*runs, *disturbed)]
     valid = [run.channels[channel].valid for run in runs]
     scaled = [_scaled(name, axes, valid) for name in _CONDITIONS]
-    conditions = [np.column_stack([x[r] for x in scaled]) for r in range(len(runs))]
-    known = np.vstack([x[v] if v.any() else x for x, v in zip(conditions, valid, strict=True)])
+    conditions = [np.column_stack(x) for x in zip(*scaled, strict=True)]
+    known = np.vstack([x[v] if v.any() else x for x, v in zip(conditions, valid, strict=False)])
     points = known[rng.choice(len(known), min(_POINTS, len(known)), replace=False)]
     values, vectors = np.linalg.eigh(_kernel(points, points))
     largest = np.argsort(values)[::-1][: limits.FEATURES]
@@ -418,9 +426,17 @@ def features(runs: Sequence[RunData], channel: Channel, rng: np.random.Generator
     out = [_kernel(x, points) @ weights for x in conditions]
     if channel.balance == MOTOR:
         out = [np.hstack((f, f * np.sign(a["velocity"])[:, None])) for f, a in zip(out, axes, strict=True)]
-    square = np.concatenate([np.sum(f[v] ** 2, axis=1) for f, v in zip(out, valid, strict=True)])
-    size = float(np.sqrt(np.mean(square))) if len(square) else 1.0
-    return [f / max(size, 1e-9) for f in out]
+    rates = [np.column_stack([a[name] for name in _RATES]) for a in axes]
+    size, each = _mean_square(out, valid), _mean_square(rates, valid)
+    scale = 1.0 / np.sqrt(np.append(np.full(len(size), np.mean(size)), each) * (len(size) + len(each)))
+    return [np.hstack(parts) * scale for parts in zip(out, rates, strict=True)]
+
+
+def _mean_square(parts: Sequence[FloatArray], valid: Sequence[BoolArray]) -> FloatArray:
+    """Return the mean square of columns over the valid bins of the runs [k]; what is zero counts as large."""
+    every = np.vstack([x[v] for x, v in zip(parts, valid, strict=False)])
+    square = np.sum(every**2, axis=0) / max(len(every), 1)
+    return np.asarray(np.where(square > 0.0, square, np.inf))
 
 
 def _kernel(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -431,8 +447,10 @@ def _kernel(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _scaled(name: str, axes: Sequence[dict[str, FloatArray]], valid: Sequence[BoolArray]) -> list[FloatArray]:
-    """Return a condition per run in standard deviations about its mean; about zero where its sign has a meaning."""
-    known = np.concatenate([a[name][v] for a, v in zip(axes, valid, strict=True)])
+    """Return a condition per run in standard deviations about its mean in the valid bins of the first runs; about zero where
+    its sign has a meaning.
+    """
+    known = np.concatenate([a[name][v] for a, v in zip(axes, valid, strict=False)])
     middle = float(np.mean(known)) if name == "link_angle" and len(known) else 0.0
     width = max(float(np.sqrt(np.mean((known - middle) ** 2))) if len(known) else 0.0, 1e-9)
     return [(a[name] - middle) / width for a in axes]

@@ -20,11 +20,9 @@ def moved(seed: int) -> RunData:
     t = np.arange(3000) * 0.01
     a, b, c = rng.uniform(0.1, 0.4, 3)
     angle = np.sin(2.0 * np.pi * a * t) + 0.4 * np.sin(2.0 * np.pi * b * t)
-    axes = {
-        "velocity": np.gradient(angle, t),
-        "load": 10.0 * np.sin(2.0 * np.pi * c * t) + 5.0 * np.sin(angle),
-        "link_angle": angle,
-    }
+    load = 10.0 * np.sin(2.0 * np.pi * c * t) + 5.0 * np.sin(angle)
+    axes = {"velocity": np.gradient(angle, t), "load": load, "link_angle": angle}
+    axes |= {"load_rate": np.gradient(load, t), "load_second_rate": np.gradient(np.gradient(load, t), t)}
     zero = np.zeros(len(t))
     return run_data(f"run{seed}", {MOTOR1: zero, TORSION1: zero}, axes)
 
@@ -45,9 +43,10 @@ def test_its_features_have_a_mean_square_of_one(channel: Channel) -> None:
         (lambda a: a["velocity"], 0.97, 1.0),
         (lambda a: np.abs(a["load"]) * np.sign(a["velocity"]), 0.9, 1.0),
         (lambda a: np.tanh(a["velocity"] / 0.5) * (1.0 + 0.02 * a["load"]), 0.95, 1.0),
+        (lambda a: np.interp(np.arange(3000.0) - 1.0, np.arange(3000.0), a["load"]) - a["load"], 0.97, 1.0),
         (lambda a: np.cos(100.0 * a["link_angle"]), 0.0, 0.05),
     ],
-    ids=["Coulomb", "viscous", "load", "another friction", "wave"],
+    ids=["Coulomb", "viscous", "load", "another friction", "late load", "wave"],
 )
 def test_it_imitates_frictions_and_no_wave(
     law: Callable[[Axes], FloatArray], least: float, most: float
