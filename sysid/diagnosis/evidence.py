@@ -27,7 +27,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
-from types import MappingProxyType
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -311,8 +310,8 @@ class Equations:
     """Whitened normal equations of all recordings over [entries' columns E | nuisances N | response].
 
     grams: per recording; noise: what the noise of torques puts into them; groups: of the variance of each nuisance; shared:
-    which nuisances are discrepancy, with a part that all runs have in common. Columns that are noise for the most part, as a
-    rate of a noisy torque is, make no entry (`noisy`) and no nuisance.
+    which nuisances are discrepancy, with a part that all runs have in common. What is noise for the most
+    part, as a rate of a noisy torque is, makes no entry (`noisy`) and no nuisance.
     """
 
     def __init__(  # noqa: PLR0917
@@ -324,12 +323,10 @@ class Equations:
         shared: Index,
         start: Mapping[object, tuple[float, float]],
         most: Mapping[object, float],
-        resemblance: Mapping[object, FloatArray] = MappingProxyType({}),
         recorded: FloatArray | None = None,
         rows: float = math.inf,
     ) -> None:
         self.entries, self.groups, self.shared = list(entries), groups, shared
-        self.resemblance = resemblance
         self.recorded = np.zeros(sum(e.size for e in entries)) if recorded is None else recorded
         self.plain, self.noise = grams.copy(), noise.copy()
         self.start, self.most = start, most
@@ -346,10 +343,18 @@ class Equations:
         blind = self.E + np.flatnonzero(much[self.E : -1])
         for g in (self.plain, self.noise):
             g[:, blind], g[:, :, blind] = 0.0, 0.0
+        self.resemblance = self._resemblance()
         self.kappa = 1.0
         self.grams = self.plain
         self.turned = np.empty((0, len(shared)))
         self._take_out(1.0)
+
+    def _resemblance(self) -> dict[object, FloatArray]:
+        """Return per discrepancy the variance of each coefficient [E] that least squares finds in one of unit variance."""
+        total = self.plain.sum(axis=0)
+        energy = np.maximum(np.diag(total)[: self.E], 1e-30)
+        many = {g: [self.E + k for k in self.shared.tolist() if self.groups[k] == g] for g in self.most}
+        return {g: np.sum((total[f, : self.E] / energy) ** 2, axis=0) for g, f in many.items()}
 
     def _take_out(self, kappa: float) -> None:
         self.kappa = kappa

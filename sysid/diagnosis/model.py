@@ -308,26 +308,8 @@ class _Work:
             self.shared,
             self.start,
             self.most,
-            self.resemblance(weights),
             rows=float(sum(d.valid.sum() for run in self.runs for d in run.channels.values())),
         )
-
-    def resemblance(self, weights: FloatArray) -> dict[object, FloatArray]:
-        """Return per discrepancy the variance of each scaled coefficient that least squares would find in a discrepancy of
-        unit variance [E].
-        """
-        found, energy = {}, np.zeros(weights.shape[1])
-        for channel in self.runs[0].channels:
-            group = ("discrepancy", channel)
-            own = [k for k, g in enumerate(self.groups) if g == group]
-            cross = np.zeros((len(own), weights.shape[1]))
-            for run in self.runs:
-                d = run.channels[channel]
-                x = d.regressors[d.valid] @ weights[d.index]
-                cross += d.nuisances[np.ix_(d.valid, d.families >= own[0])][:, : len(own)].T @ x
-                energy += np.sum(x * x, axis=0)
-            found[group] = np.sum(cross**2, axis=0)
-        return {g: part / np.maximum(energy, 1e-30) ** 2 for g, part in found.items()}
 
     def first_residuals(self) -> dict[Channel, list[FloatArray]]:
         """Return what the values of the file, the waves and the runs' own changes leave under their priors, per run [n].

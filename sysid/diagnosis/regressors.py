@@ -447,9 +447,7 @@ def _kernel(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _scaled(name: str, axes: Sequence[dict[str, FloatArray]], valid: Sequence[BoolArray]) -> list[FloatArray]:
-    """Return a condition per run in standard deviations about its mean in the valid bins of the first runs; about zero where
-    its sign has a meaning.
-    """
+    """Return a condition per run in deviations of the runs about their mean; about zero where its sign has a meaning."""
     known = np.concatenate([a[name][v] for a, v in zip(axes, valid, strict=False)])
     middle = float(np.mean(known)) if name == "link_angle" and len(known) else 0.0
     width = max(float(np.sqrt(np.mean((known - middle) ** 2))) if len(known) else 0.0, 1e-9)

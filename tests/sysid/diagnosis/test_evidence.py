@@ -248,7 +248,7 @@ def test_nuisances_and_discrepancy_are_integrated_out(
 ) -> None:
     equations = equations_of(drifting, [entry() for _ in range(3)], GROUPS, shared=(2, 3))
     y = np.concatenate([b[:, -1] for b in drifting])
-    sets = equations.sets(VARIANCES, beside)
+    sets = equations.sets(VARIANCES, beside, resembling=False)
     dense = log_density(y, covariance_of(drifting, sorted(chosen), sorted(beside))) + EVEN * len(chosen)
     nothing = log_density(y, covariance_of(drifting, (), sorted(beside)))
     assert sets.fit(chosen).evidence - sets.fit(frozenset()).evidence == pytest.approx(
@@ -265,7 +265,8 @@ def test_a_set_is_scored_with_a_discrepancy_beside_it(drifting: list[FloatArray]
     of = covariance_of(drifting, sorted(chosen), sorted(chosen))
     dense = log_density(y, of) + EVEN * len(chosen) - log_density(y, covariance_of(drifting, ()))
     assert score - empty == pytest.approx(-2.0 * dense, abs=1e-8)
-    assert means.beta == pytest.approx(equations.sets(VARIANCES, chosen).fit(chosen).mean)
+    sets = equations.sets(VARIANCES, chosen, resembling=False)
+    assert means.beta == pytest.approx(sets.fit(chosen).mean)
     assert len(means.own) == len(drifting)
     column, feature = (
         equations.beside(chosen).grams.sum(axis=0)[: len(chosen)],
@@ -278,6 +279,10 @@ def test_a_set_is_scored_with_a_discrepancy_beside_it(drifting: list[FloatArray]
 def test_what_resembles_an_entry_is_no_evidence_for_it(drifting: list[FloatArray]) -> None:
     """A discrepancy that may look like entry 0 as much as 2 is large: a prior of its own beside the set's."""
     plain = equations_of(drifting, [entry() for _ in range(3)], GROUPS, shared=(2, 3))
+    rows = np.vstack(drifting)
+    for k, found in enumerate(plain.resemblance["discrepancy"]):
+        of_one = [np.linalg.lstsq(rows[:, [k]], rows[:, j], rcond=None)[0][0] for j in (5, 6)]
+        assert found == pytest.approx(sum(x * x for x in of_one)), "of least squares in each feature"
     alike = copy(plain)
     alike.resemblance = {"discrepancy": np.array([0.64, 0.0, 4.0]) / 0.74}
     deviation = alike.deviation(VARIANCES)
@@ -293,7 +298,8 @@ def test_what_resembles_an_entry_is_no_evidence_for_it(drifting: list[FloatArray
         dense = log_density(y, base + column @ column.T) - log_density(y, base) + EVEN * len(chosen)
         sets = alike.sets(VARIANCES)
         assert sets.fit(chosen).evidence - sets.fit(frozenset()).evidence == pytest.approx(dense, abs=1e-8)
-    assert alike.sets(VARIANCES).gains(frozenset())[0] < 0.1 * plain.sets(VARIANCES).gains(frozenset())[0]
+    without = plain.sets(VARIANCES, resembling=False)
+    assert alike.sets(VARIANCES).gains(frozenset())[0] < 0.1 * without.gains(frozenset())[0]
 
 
 def test_one_gain_stands_for_all_that_it_scales() -> None:
@@ -468,8 +474,6 @@ def test_an_entry_that_a_discrepancy_nearly_follows_is_found_among_weak_ones() -
     group = "discrepancy"
     entries = [entry(odds=-3.0), *(entry(odds=-1.0) for _ in range(6))]
     equations = equations_of([block], entries, (group,) * 12, shared=range(12), start=1e-4)
-    alike = float(np.sum((f.T @ x) ** 2)) / float(x @ x) ** 2
-    equations.resemblance = {group: np.array([alike, *[0.0] * 6])}
     search = _Search(equations)
     hiding = equations.sets(search.own(frozenset()).variances)
     assert hiding.search(frozenset()) == frozenset(), "else this shows nothing"
