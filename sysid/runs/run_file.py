@@ -254,20 +254,20 @@ def _last_digit(time_s: FloatArray) -> FloatArray | None:
 
 
 def _with_spread_stamps(content: Content) -> Content:
-    """Return the content with rounded stamps that equal the one before spread between their neighbours, and a note;
-    unchanged where there are more rows than the time can hold.
+    """Return the content with stamps that are not after all before them, rounded or late by less than a step, spread between
+    their neighbours, and a note; unchanged where there are more rows than the time can hold.
     """
-    time_s = content.values[TIME]
-    steps = np.diff(time_s)
-    if len(steps) < 2 or not np.all(steps >= 0.0) or np.all(steps > 0.0):
+    steps = np.diff(time_s := content.values[TIME])
+    least = np.min(steps, initial=np.inf)
+    usual = np.median(steps[steps > 0.0]) if np.any(steps > 0.0) else 0.0
+    if least > 0.0 or least <= -usual:
         return content
-    new = np.concatenate(([True], steps > 0.0))
-    rows = np.flatnonzero(new)
-    many = not new[-1] or np.max(np.diff(rows)) > _MOST_ALIKE
-    if many or np.mean(steps) < _LEAST_STEP * np.median(steps[steps > 0.0]):
+    rows = np.flatnonzero(np.append(True, time_s[1:] > np.maximum.accumulate(time_s)[:-1]))
+    full = least == 0.0 and np.mean(steps) < _LEAST_STEP * usual  # of what jitters, no usual step is so sure
+    if full or rows[-1] + 1 < len(time_s) or np.max(np.diff(rows)) > _MOST_ALIKE:
         return content
     spread = np.interp(np.arange(len(time_s)), rows, time_s[rows])
-    note = f"{counted(int(np.sum(~new)), 'stamp')} like the one before: rounded, spread between those around"
+    note = f"{counted(len(time_s) - len(rows), 'stamp')} not after the one before: spread between neighbours"
     return replace(content, values={**content.values, TIME: spread}, notes=(*content.notes, note))
 
 

@@ -206,7 +206,20 @@ def test_stamps_that_were_rounded_to_the_same_number_are_spread(tmp_path):
     assert np.all(np.diff(run.table.time_s) > 0.0)
     assert run.table.time_s == pytest.approx(t, abs=1.01e-3)
     count = np.count_nonzero(np.diff(t) == 0.0)
-    assert f"{count} stamps like the one before: rounded, spread between those around" in run.notes
+    assert f"{count} stamps not after the one before: spread between neighbours" in run.notes
+
+
+def test_stamps_that_jitter_by_a_step_are_spread(tmp_path):
+    """A host stamps what it receives: now and then two rows come late, the first more than the second."""
+    t = 0.001 * np.arange(3000.0)
+    t[[500, 1700]] += 1.3e-3
+    [run] = read_runs([_table(tmp_path / "a.csv", {"time_s": t, "j1.current_a": np.sin(t)})], segments=True)
+    assert np.all(np.diff(run.table.time_s) > 0.0)
+    assert run.table.time_s == pytest.approx(0.001 * np.arange(3000.0), abs=1.4e-3)
+    assert "2 stamps not after the one before: spread between neighbours" in run.notes
+    t[500] += 0.1  # no jitter: one wrong stamp
+    with pytest.raises(RunError, match=r"line 503: found time .*expected rising time"):
+        read_runs([_table(tmp_path / "a.csv", {"time_s": t, "j1.current_a": np.sin(t)})], segments=True)
 
 
 def test_an_unfinished_last_row_is_left_out_with_a_note(tmp_path):
