@@ -32,7 +32,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.entries import Entry
 from jtqd.sysid.diagnosis.regressors import Index
@@ -311,7 +311,7 @@ class Equations:
 
     grams: per recording; noise: what the noise of torques puts into them; groups: of the variance of each nuisance; shared:
     which nuisances are discrepancy, with a part that all runs have in common. What is noise for the most
-    part, as a rate of a noisy torque is, makes no entry (`noisy`) and no nuisance.
+    part makes no entry (`noisy`), and no nuisance of a recording, nor does a feature of which a set leaves little more.
     """
 
     def __init__(  # noqa: PLR0917
@@ -328,7 +328,7 @@ class Equations:
     ) -> None:
         self.entries, self.groups, self.shared = list(entries), groups, shared
         self.recorded = np.zeros(sum(e.size for e in entries)) if recorded is None else recorded
-        self.plain, self.noise = grams.copy(), noise.copy()
+        self.plain, self.noise = grams, noise
         self.start, self.most = start, most
         self.E, self.N = sum(e.size for e in entries), len(groups)
         self.kinds = sorted(set(groups), key=str)
@@ -337,21 +337,23 @@ class Equations:
         self._outer = np.concatenate((np.arange(self.E), self.E + shared, [self.E + self.N])).astype(np.intp)
         sides = np.append(np.arange(self.E), self.E + self.N)
         self.scatter = Scatter(noise.sum(axis=0)[np.ix_(sides, sides)], rows)
-        signal, much = (np.einsum("rii->i", g) for g in (grams, noise))
-        much = much > _NOISY * signal
+        much = self._much(grams.sum(axis=0), noise.sum(axis=0))
         self.noisy = frozenset(k for k, s in enumerate(slices_of(entries)) if much[s].any())
-        blind = self.E + np.flatnonzero(much[self.E : -1])
-        for g in (self.plain, self.noise):
-            g[:, blind], g[:, :, blind] = 0.0, 0.0
-        self.resemblance = self._resemblance()
         self.kappa = 1.0
-        self.grams = self.plain
+        self.grams = grams
         self.turned = np.empty((0, len(shared)))
         self._take_out(1.0)
+        self.resemblance = self._resemblance()
+
+    @staticmethod
+    def _much(grams: FloatArray, noise: FloatArray) -> BoolArray:
+        """Return the columns that are noise for the most part, as a rate of a noisy torque is [..., E + N + 1]."""
+        energy, of_noise = (np.diagonal(g, axis1=-2, axis2=-1) for g in (grams, noise))
+        return np.asarray(of_noise > _NOISY * energy, np.bool_)
 
     def _resemblance(self) -> dict[object, FloatArray]:
         """Return per discrepancy the variance of each coefficient [E] that least squares finds in one of unit variance."""
-        total = self.plain.sum(axis=0)
+        total = self.grams.sum(axis=0)
         energy = np.maximum(np.diag(total)[: self.E], 1e-30)
         many = {g: [self.E + k for k in self.shared.tolist() if self.groups[k] == g] for g in self.most}
         return {g: np.sum((total[f, : self.E] / energy) ** 2, axis=0) for g, f in many.items()}
@@ -360,6 +362,9 @@ class Equations:
         self.kappa = kappa
         self.grams = self.plain - kappa * self.noise
         self.grams[:, -1, -1] = self.plain[:, -1, -1]
+        seen = ~self._much(self.plain, self.noise)
+        seen[:, : self.E], seen[:, -1] = True, True
+        self.grams *= seen[:, :, None] & seen[:, None, :]
 
     def beside(self, chosen: Set) -> Equations:
         """Return the equations with a discrepancy that has no part along the columns of a set: what a set explains is no
