@@ -306,12 +306,16 @@ class Sets:
         ]
 
 
+def _mostly(noise: FloatArray, grams: FloatArray) -> BoolArray:
+    """Return the columns that are noise for the most part, as a rate of a noisy torque is [..., E + N + 1]."""
+    return np.asarray(np.diagonal(noise, 0, -2, -1) > _NOISY * np.diagonal(grams, 0, -2, -1), np.bool_)
+
+
 class Equations:
     """Whitened normal equations of all recordings over [entries' columns E | nuisances N | response].
 
     grams: per recording; noise: what the noise of torques puts into them; groups: of the variance of each nuisance; shared:
-    which nuisances are discrepancy, with a part that all runs have in common. What is noise for the most
-    part makes no entry (`noisy`), and no nuisance of a recording, nor does a feature of which a set leaves little more.
+    which nuisances are discrepancy, with a part that all runs have in common. What is mostly noise is none, nor an entry.
     """
 
     def __init__(  # noqa: PLR0917
@@ -328,8 +332,7 @@ class Equations:
     ) -> None:
         self.entries, self.groups, self.shared = list(entries), groups, shared
         self.recorded = np.zeros(sum(e.size for e in entries)) if recorded is None else recorded
-        self.plain, self.noise = grams, noise
-        self.start, self.most = start, most
+        self.plain, self.noise, self.start, self.most = grams, noise, start, most
         self.E, self.N = sum(e.size for e in entries), len(groups)
         self.kinds = sorted(set(groups), key=str)
         self.member = {g: np.array([k for k, h in enumerate(groups) if h == g], np.intp) for g in self.kinds}
@@ -337,19 +340,11 @@ class Equations:
         self._outer = np.concatenate((np.arange(self.E), self.E + shared, [self.E + self.N])).astype(np.intp)
         sides = np.append(np.arange(self.E), self.E + self.N)
         self.scatter = Scatter(noise.sum(axis=0)[np.ix_(sides, sides)], rows)
-        much = self._much(grams.sum(axis=0), noise.sum(axis=0))
+        much = _mostly(noise.sum(axis=0), grams.sum(axis=0))
         self.noisy = frozenset(k for k, s in enumerate(slices_of(entries)) if much[s].any())
-        self.kappa = 1.0
-        self.grams = grams
         self.turned = np.empty((0, len(shared)))
         self._take_out(1.0)
         self.resemblance = self._resemblance()
-
-    @staticmethod
-    def _much(grams: FloatArray, noise: FloatArray) -> BoolArray:
-        """Return the columns that are noise for the most part, as a rate of a noisy torque is [..., E + N + 1]."""
-        energy, of_noise = (np.diagonal(g, axis1=-2, axis2=-1) for g in (grams, noise))
-        return np.asarray(of_noise > _NOISY * energy, np.bool_)
 
     def _resemblance(self) -> dict[object, FloatArray]:
         """Return per discrepancy the variance of each coefficient [E] that least squares finds in one of unit variance."""
@@ -362,7 +357,7 @@ class Equations:
         self.kappa = kappa
         self.grams = self.plain - kappa * self.noise
         self.grams[:, -1, -1] = self.plain[:, -1, -1]
-        seen = ~self._much(self.plain, self.noise)
+        seen = ~_mostly(self.noise, self.plain)
         seen[:, : self.E], seen[:, -1] = True, True
         self.grams *= seen[:, :, None] & seen[:, None, :]
 

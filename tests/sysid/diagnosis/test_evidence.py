@@ -520,3 +520,16 @@ def test_a_column_that_is_mostly_noise_is_in_no_set() -> None:
     equations = equations_of([block], [entry(odds=9.0), entry(odds=9.0)], ("zero",), noise=noise)
     assert equations.noisy == {0}
     assert 0 not in equations.sets({"zero": 0.1}).search(frozenset())
+
+
+def test_a_nuisance_that_is_mostly_noise_in_a_recording_is_none_there() -> None:
+    """Where a run hardly creeps, its presliding friction is noise, however large the variance of it."""
+    rng = np.random.default_rng(9)
+    blocks = [np.column_stack((rng.normal(size=(200, 2)), rng.normal(size=200))) for _ in range(2)]
+    blocks[1][:, 1] *= 1e-3
+    noise = np.array([np.zeros((3, 3)), np.diag([0.0, 1.1e-6 * 200, 0.0])])
+    equations = equations_of(blocks, [entry()], ("smooth",), noise=noise)
+    _, score, _ = equations.expected(frozenset({0}), {"smooth": 1e6}, 0)
+    blocks[1][:, 1] = 0.0
+    without = equations_of(blocks, [entry()], ("smooth",))
+    assert score == pytest.approx(without.expected(frozenset({0}), {"smooth": 1e6}, 0)[1])
