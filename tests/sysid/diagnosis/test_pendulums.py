@@ -445,8 +445,10 @@ def test_a_delay_within_a_step_predicts_and_is_no_certain_cause() -> None:
     found = diagnose(runs, {1: ARM})
     [delay] = [c for c in (*found.causes, *found.too_small) if c.name == "channel_delay"]
     assert delay.grade in {ONE_OF, EFFECTIVE}
-    assert delay.parameters["delay_s"].value == pytest.approx(0.004, abs=4e-4)
-    assert any(p.name == "channel_delay" for p in found.predicts)
+    low, high = delay.parameters["delay_s"].ci95
+    assert low < 0.004 < high, "a part of it may be a discrepancy in the load's rate"
+    [predicting] = [p for p in found.predicts if p.name == "channel_delay"]
+    assert predicting.values["delay_s"] == pytest.approx(0.004, abs=4e-4)
 
 
 def test_outliers_are_looked_for_as_recorded_and_balances_judged_where_the_torque_is_known(
