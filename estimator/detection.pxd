@@ -91,7 +91,7 @@ cdef struct Samples:  # hashes of the last 256 samples, and where the last one w
     uint64_t words[256]
     uint8_t at[256]
     uint8_t next, lag  # lag: of the run that is followed, 0 for none
-    int run, unlike  # samples of it that differ from the one before them; samples that continued none, up to KNOWN_RUNS
+    int run, length, unlike  # samples of it that differ from the one before; all of it; samples that continued none, up to KNOWN_RUNS
     double usual, weight  # mean length of runs; log(1 + 1/usual)
 
 cdef class Plausibility:

@@ -16,7 +16,7 @@
 | REPEATED | samples, all four numbers, equal those of a fixed number of samples ago for longer than chance | they have come before: all later ones are as old |
 
 Noise does not come twice. A run of samples equal to those of `lag` samples ago (2 to 255) is as long as chance makes it: geometric,
-of the mean length of KNOWN_RUNS. A sample equal to the last one, or without noise from the start on, is no proof.
+of the mean length of KNOWN_RUNS. No proof is a sample equal to the last one, or no noise from the start on, or a run beyond its lag.
 
     run log(1 + 1/usual) > RARE
 
@@ -88,6 +88,7 @@ cdef int MOTOR_JUMP = st.MOTOR_JUMP, LINK_JUMP = st.LINK_JUMP, VELOCITY_MISMATCH
 cdef int TORSION = st.TORSION, CURRENT_FROZEN = st.CURRENT_FROZEN, REPEATED = st.REPEATED
 cdef double RARE = 28.0  # logarithm of how rarely chance repeats so many samples: less than once in years
 cdef int KNOWN_RUNS = 64  # of equal samples, or samples unlike all before: their mean is known, and is a mean of so many
+cdef double LEAST_RUN = 0.25  # of the usual length: what moved without a repetition may come to rest with few values
 cdef uint64_t ODD = 0x9E3779B97F4A7C15
 
 cdef inline uint64_t _mixed(uint64_t word, double value) noexcept nogil:
@@ -105,24 +106,23 @@ cdef bint _repeats(Samples *s, uint64_t word) noexcept nogil:
     s.next += 1
     s.words[k] = word
     if s.lag and word == s.words[<uint8_t> (k - s.lag)]:
-        s.run += differs
+        s.run, s.length = s.run + differs, s.length + 1
     else:
         if s.lag:
             s.usual += (s.run - s.usual) / KNOWN_RUNS
-            s.weight = log1p(1.0 / max(s.usual, 1e-3))
+            s.weight = log1p(1.0 / max(s.usual, LEAST_RUN))
         s.unlike += differs and s.unlike < KNOWN_RUNS
         seen = s.at[slot]
-        s.run, s.lag = 0, <uint8_t> (k - seen)
+        s.run, s.length, s.lag = 0, 1, <uint8_t> (k - seen)
         if not differs or seen == k or word != s.words[seen]:
             s.lag = 0
         else:  # another lag had been taken meanwhile: what equals before counts as well
             at, earlier = last, <uint8_t> (seen - 1)
             while earlier != k and s.words[at] == s.words[earlier]:
-                at -= 1
-                s.run += s.words[at] != s.words[<uint8_t> (at + 1)]
-                earlier -= 1
+                s.run += s.words[at] != s.words[<uint8_t> (at - 1)]
+                at, earlier, s.length = at - 1, earlier - 1, s.length + 1
     s.at[slot] = k
-    return s.run * s.weight > RARE and s.unlike == KNOWN_RUNS
+    return s.run * s.weight > RARE and s.length <= s.lag and s.unlike == KNOWN_RUNS
 
 
 cdef class Plausibility:

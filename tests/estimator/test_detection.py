@@ -171,6 +171,15 @@ def test_a_repetition_is_told_by_its_samples_and_not_by_those_that_stand_still()
     assert {check.step(PERIOD_S, *rows[n // 7 % 2]) for n in range(20_000)} == {0}
 
 
+@pytest.mark.parametrize("period", [4, 12, 16])
+def test_a_limit_cycle_at_rest_repeats_and_is_not_old(period: int) -> None:
+    """A noisy joint stops, and its current goes up and down in the counts of its converter, the same every time."""
+    check = checks()
+    assert {check.step(PERIOD_S, *row) for row in _noisy(20_000, 1.5, 2)} == {0}
+    cycle = [8e-3 * abs(n - period // 2) for n in range(period)]
+    assert {check.step(PERIOD_S, 0.0, 0.0, 0.0, cycle[n % period]) for n in range(5000)} == {0}
+
+
 def test_no_current_at_all_while_the_motor_is_turned_is_no_fault() -> None:
     check = checks()
     for n in range(3000):
