@@ -427,16 +427,16 @@ def features(
     if channel.balance == MOTOR:
         out = [np.hstack((f, f * np.sign(a["velocity"])[:, None])) for f, a in zip(out, axes, strict=True)]
     rates = [np.column_stack([a[name] for name in _RATES]) for a in axes]
-    size, each = _mean_square(out, valid), _mean_square(rates, valid)
-    scale = 1.0 / np.sqrt(np.append(np.full(len(size), np.mean(size)), each) * (len(size) + len(each)))
+    size = _mean_square(out, valid)
+    square = np.append(np.full(len(size), np.mean(size)), _mean_square(rates, valid))
+    scale = 1.0 / np.sqrt(np.where(square > 0.0, square, np.inf) * len(square))
     return [np.hstack(parts) * scale for parts in zip(out, rates, strict=True)]
 
 
 def _mean_square(parts: Sequence[FloatArray], valid: Sequence[BoolArray]) -> FloatArray:
-    """Return the mean square of columns over the valid bins of the runs [k]; what is zero counts as large."""
+    """Return the mean square of columns over the valid bins of the runs [k]."""
     every = np.vstack([x[v] for x, v in zip(parts, valid, strict=False)])
-    square = np.sum(every**2, axis=0) / max(len(every), 1)
-    return np.asarray(np.where(square > 0.0, square, np.inf))
+    return np.asarray(np.sum(every**2, axis=0) / max(len(every), 1))
 
 
 def _kernel(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,6 +35,15 @@ RUNS = [moved(k) for k in range(3)]
 def test_its_features_have_a_mean_square_of_one(channel: Channel) -> None:
     made = np.vstack(features(RUNS, channel, np.random.default_rng(0)))
     assert np.mean(np.sum(made**2, axis=1)) == pytest.approx(1.0)
+
+
+def test_a_joint_that_is_held_has_a_discrepancy_too() -> None:
+    """Nothing of it is in the direction of motion."""
+    held = [replace(run, axes={1: run.axes[1] | {"velocity": np.zeros(3000)}}) for run in RUNS]
+    made = np.vstack(features(held, MOTOR1, np.random.default_rng(0)))
+    load = np.concatenate([run.axes[1]["load"] for run in held])
+    left = load - made @ np.linalg.lstsq(made, load, rcond=None)[0]
+    assert float(left @ left) < 0.05 * float(load @ load)
 
 
 @pytest.mark.parametrize(
