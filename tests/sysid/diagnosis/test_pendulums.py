@@ -444,7 +444,7 @@ def test_a_delay_within_a_step_predicts_and_is_no_certain_cause() -> None:
         runs.append((name, replace(table, joints={1: replace(table.joints[1], torque_nm=torque)})))
     found = diagnose(runs, {1: ARM})
     [delay] = [c for c in (*found.causes, *found.too_small) if c.name == "channel_delay"]
-    assert delay.grade in {ONE_OF, EFFECTIVE}
+    assert delay.grade == EFFECTIVE
     low, high = delay.parameters["delay_s"].ci95
     assert low < 0.004 < high, "a part of it may be a discrepancy in the load's rate"
     [predicting] = [p for p in found.predicts if p.name == "channel_delay"]
