@@ -59,10 +59,19 @@ UNLIKE = [name for name, entry in UNKNOWN.items() if not entry.resembling]
 
 @pytest.fixture(scope="module")
 def long_cases() -> list[Case]:
-    """Runs of 20 s, integrated side by side: nothing hidden, quiet; with noise; each unknown thing."""
+    """Runs of 12 s, integrated side by side: nothing hidden, quiet; with noise; each unknown thing."""
     print(f"seed {SEED}")
-    unknown = [Order(SEED + k, ((n, 1, UNKNOWN[n].high),), runs=4, quiet=True) for k, n in enumerate(UNLIKE)]
-    return draw_many([Order(SEED, quiet=True), Order(SEED, profile="slow", runs=2), *unknown])
+    unknown = [
+        Order(SEED + k, ((n, 1, UNKNOWN[n].high),), runs=4, duration_s=12.0, quiet=True)
+        for k, n in enumerate(UNLIKE)
+    ]
+    return draw_many(
+        [
+            Order(SEED, duration_s=12.0, quiet=True),
+            Order(SEED, profile="slow", runs=2, duration_s=12.0),
+            *unknown,
+        ]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -136,8 +145,8 @@ def test_size_is_the_deviation_of_the_leading_parameter() -> None:
 def test_hidden_thing_changes_nothing_else_of_its_seed() -> None:
     plain, hidden = draw_many(
         [
-            Order(SEED, runs=2, duration_s=5.0),
-            Order(SEED, (("sensor_offset", SENSOR, 0.8),), runs=2, duration_s=5.0),
+            Order(SEED, runs=2, duration_s=2.0),
+            Order(SEED, (("sensor_offset", SENSOR, 0.8),), runs=2, duration_s=2.0),
         ]
     )
     assert plain.joints == hidden.joints
@@ -145,13 +154,13 @@ def test_hidden_thing_changes_nothing_else_of_its_seed() -> None:
     for a, b in zip(plain.runs, hidden.runs, strict=True):
         assert np.allclose(b["j1.torque_nm"] - a["j1.torque_nm"], offset)
         assert np.array_equal(a["j2.motor_position_rad"], b["j2.motor_position_rad"])
-    again = draw(SEED, runs=2, duration_s=5.0).runs[0]
+    again = draw(SEED, runs=2, duration_s=2.0).runs[0]
     assert all(np.array_equal(again[k], x) for k, x in plain.runs[0].items())
 
 
 def test_case_does_not_depend_on_its_neighbours_in_the_batch() -> None:
-    odd = Order(SEED + 1, (("coupling_slip", 1, None),), runs=2, duration_s=6.0)
-    rich = Order(SEED + 2, (("hysteresis", 1, None), ("kinematic_error", 2, None)), runs=2, duration_s=6.0)
+    odd = Order(SEED + 1, (("coupling_slip", 1, None),), runs=2, duration_s=3.0)
+    rich = Order(SEED + 2, (("hysteresis", 1, None), ("kinematic_error", 2, None)), runs=2, duration_s=3.0)
     alone = draw_many([odd])[0]
     beside = draw_many([rich, odd])[1]
     assert alone.truth == beside.truth
@@ -167,7 +176,7 @@ def test_energy_goes_into_friction_and_nowhere_else() -> None:
         Hidden("nonlinear_stiffness", 2, None),
         Hidden("torque_ripple", 1, {"amplitude_nm": 1.0}),
     )
-    case = draw(SEED, hidden, runs=2, duration_s=10.0, quiet=True)
+    case = draw(SEED, hidden, runs=2, duration_s=5.0, quiet=True)
     for columns in case.runs:
         t = columns["time_s"]
         work = lost = 0.0
@@ -192,7 +201,7 @@ def test_rests_are_standstill_with_zero_current(plain: Case) -> None:
 
 
 def test_finer_steps_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    order = Order(SEED, (("hysteresis", 1, None),), profile="fourier", runs=2, duration_s=3.0, quiet=True)
+    order = Order(SEED, (("hysteresis", 1, None),), profile="fourier", runs=2, duration_s=1.0, quiet=True)
     coarse = draw_many([order])[0]
     monkeypatch.setattr(plant_module, "SUBSTEPS", 16)
     fine = draw_many([order])[0]
