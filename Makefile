@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo hidden-effect docs deb release test test-here test-sysid test-hidden test-guest test-native test-alone test-sanitized test-all mutants bench bench-kernel kernel-with-vcan fuzz soak soak-exact lint style types format clean
+.PHONY: help setup demo hidden-effect docs deb release test test-here test-sysid test-hidden test-guest test-native test-sanitized test-all mutants bench bench-kernel kernel-with-vcan fuzz soak soak-exact lint style types format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -28,7 +28,7 @@ test: style ## everything but the tests marked campaign
 	$(BIN)/python -m compileall -q daemon drivers estimator models sim_can sysid tests tools validation
 	@status=0; \
 	$(MAKE) --no-print-directory -k -j5 --output-sync=target test-guest test-sysid test-hidden test-here types || status=$$?; \
-	$(MAKE) --no-print-directory -k test-native test-alone || status=$$?; \
+	$(MAKE) --no-print-directory -k test-native || status=$$?; \
 	exit $$status
 
 # All lanes that keep no time of this machine at once; the bench kernel keeps a time of its own, so it feels none of them.
@@ -54,13 +54,10 @@ test-hidden:
 test-guest: kernel-with-vcan
 	nice -n 5 $(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign" $(call MARKED,socketcan|boots)
 
-# Processes at the pace of this machine's clock, whose inputs come in time: nothing beside them.
+# Processes at the pace of this machine's clock, whose inputs come in time, or that are judged by how quick or how often
+# something is: nothing beside them.
 test-native:
-	$(BIN)/python -m pytest $(SLOWEST) -m "native and not (measures or campaign or socketcan or boots)" $(call MARKED,native)
-
-# The same, judged by how quick or how often something is.
-test-alone:
-	$(BIN)/python -m pytest $(SLOWEST) -m "measures and not (campaign or socketcan or boots)" $(call MARKED,measures)
+	$(BIN)/python -m pytest $(SLOWEST) -m "native and not (campaign or socketcan or boots)" $(call MARKED,native)
 
 test-all: lint kernel-with-vcan ## everything: also the long tests, two releases that must be equal, the mutants, the sanitizers
 	$(BIN)/python -m pytest

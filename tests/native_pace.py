@@ -27,6 +27,11 @@ class NativePace:
         self.told = []
 
     @pytest.hookimpl
+    def pytest_collection_modifyitems(self, items):
+        """What is judged by how quick it is comes first, while no daemon runs that other tests share."""
+        items.sort(key=lambda item: item.get_closest_marker("measures") is None)
+
+    @pytest.hookimpl
     def pytest_runtest_protocol(self, item, nextitem):
         if item.get_closest_marker("native") is None:
             return None

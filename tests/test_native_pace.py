@@ -91,6 +91,13 @@ def test_an_unmarked_test_is_never_tried_again(pytester):
     assert pace.told == []
 
 
+def test_what_is_judged_by_how_quick_it_is_comes_first(pytester):
+    pytester.makeini("[pytest]\nmarkers = measures")
+    pytester.makepyfile("import pytest\ndef test_a(): pass\n@pytest.mark.measures\ndef test_b(): pass")
+    result = pytester.inline_run("-p", "no:cacheprovider", plugins=[NativePace()])
+    assert [each.nodeid.split("::")[1] for each in result.listoutcomes()[0]] == ["test_b", "test_a"]
+
+
 def test_the_mark_of_a_lane_stands_in_the_file_of_its_tests():
     """The Makefile gives a lane the files that name its mark: a test with a mark from elsewhere would be in none."""
     named = re.compile(r"\bmark\.(socketcan|boots|native|measures)\b|getattr\(pytest\.mark")
