@@ -211,7 +211,9 @@ def test_quick_prints_the_table_and_the_ratios():
 
 @needs_gcc
 def test_results_as_json_hold_every_stage_and_all_loops():
-    content = json.loads(benchmark("stages", "grid", "--quick", "--minutes", "0.01", "--json"))
+    content = json.loads(
+        benchmark("stages", "grid", "--rounds", "2", "--seconds", "0.6", "--minutes", "0.01", "--json")
+    )
     stages = content["stages"]["stages"]
     assert set(stages) >= {"begin", "gather", "observe", "publish", "record"}
     assert all(each["median_us"] > 0.0 for each in stages.values())

@@ -120,7 +120,7 @@ class Run:
         pytest.param(1, True, marks=pytest.mark.campaign),
         (1, False),
         (3, True),
-        (4, True),
+        pytest.param(4, True, marks=pytest.mark.campaign),
         pytest.param(4, False, marks=pytest.mark.campaign),
     ],
 )

@@ -118,7 +118,7 @@ def temperatures(log: Path, number: int) -> tuple[list[float], list[float]]:
 
 
 def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]) -> None:
-    options = ["--bus", "sim", "--duration", "3", "--record", str(tmp_path / "logs"), "--json"]
+    options = ["--bus", "sim", "--duration", "2", "--record", str(tmp_path / "logs"), "--json"]
     result = run(*options, environment=environment)
     assert result.returncode == 0, result.stderr
     no_traceback(result)
@@ -128,7 +128,7 @@ def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]
     ]
     summary = json.loads(result.stdout)
     slots = summary["cycles"] + summary["missed"] + summary["counters"]["sync_gaps"]
-    assert slots == pytest.approx(3000, abs=2)
+    assert slots == pytest.approx(2000, abs=2)
     recording = summary["recording"]
     assert recording["lost"] == 0
     assert recording["cycles"] == summary["cycles"]
@@ -151,7 +151,7 @@ def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]
         assert set(values[-500:]) <= set(sent), (
             "known half a second after the start, by the frames of the log"
         )
-        assert 4 <= len(sent) <= 7
+        assert 3 <= len(sent) <= 5
         assert f"drive_{number}_TPDO3: 2 drive_{number}" in dbc
 
 

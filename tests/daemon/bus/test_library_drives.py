@@ -229,7 +229,7 @@ def test_objects_of_the_makers_own() -> None:
     }
     joint_2 = {"file": str(shipped("joint1.yaml"))}
     with a_bench() as bench, bench.served(joint_1={"objects": objects}, joint_2=joint_2):
-        bench.expect(lambda: len(bench.torques_nm) > 600)
+        bench.expect(lambda: len(bench.pairs()) > 300)
         agree(bench.pairs(), 0.3)
 
 

@@ -20,11 +20,11 @@ from tests.paths import ROOT
 
 @functools.cache
 def bench_log():
-    """Path of an MCAP file: 5 s of `jtqd --bus sim`."""
+    """Path of an MCAP file: 3 s of `jtqd --bus sim`."""
     directory = Path(tempfile.mkdtemp(prefix="jtqd-viewer-log-"))
     atexit.register(shutil.rmtree, directory, ignore_errors=True)
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": str(ROOT)}
-    arguments = ["--bus", "sim", "--record", str(directory / "logs"), "--duration", "5", "--json"]
+    arguments = ["--bus", "sim", "--record", str(directory / "logs"), "--duration", "3", "--json"]
     done = subprocess.run(
         [sys.executable, "-m", "jtqd.daemon.jtqd", *arguments],
         env=environment,
