@@ -40,13 +40,8 @@ cdef struct ContactState:
 cdef int fill_link(LinkLaw *law, joint, torsion) except -1
 cdef void restart_link(LinkState *s) noexcept nogil
 cdef void update_link(
-    const LinkLaw *law,
-    LinkState *s,
-    const FusedObserverLaw *observer,
-    const FusedObserverState *observed,
-    double torsion_nm,
-    double dt,
-    LinkLoad *out,
+    const LinkLaw *law, LinkState *s, const FusedObserverLaw *observer, const FusedObserverState *observed,
+    double torsion_nm, double dt, LinkLoad *out
 ) noexcept nogil
 cdef int fill_contact(ContactLaw *law, double threshold_nm, double period_s) except -1
 cdef void restart_contact(ContactState *s) noexcept nogil

@@ -152,12 +152,8 @@ cdef class Plausibility:
         self.samples.usual, self.samples.weight = 1.0, log1p(1.0)
 
     def step(
-        self,
-        double dt_s,
-        double motor_position_rad,
-        double motor_velocity_rad_s,
-        double link_position_rad,
-        double current_a,
+        self, double dt_s, double motor_position_rad, double motor_velocity_rad_s, double link_position_rad,
+        double current_a
     ):
         """Return the faults of this sample, dt_s [s] after the one before: 0, or the bits of the table above."""
         return self.check(dt_s, motor_position_rad, motor_velocity_rad_s, link_position_rad, current_a)
@@ -400,13 +396,8 @@ cdef void restart_link(LinkState *s) noexcept nogil:
 
 
 cdef void update_link(
-    const LinkLaw *law,
-    LinkState *s,
-    const FusedObserverLaw *observer,
-    const FusedObserverState *observed,
-    double torsion_nm,
-    double dt,
-    LinkLoad *out,
+    const LinkLaw *law, LinkState *s, const FusedObserverLaw *observer, const FusedObserverState *observed,
+    double torsion_nm, double dt, LinkLoad *out
 ) noexcept nogil:
     """Take a sample of the observer, dt [s] after the last; torsion_nm: tau_t."""
     cdef double fast, stiffness, step, torque

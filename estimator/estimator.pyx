@@ -107,14 +107,8 @@ cdef class Estimator:
         raise NotImplementedError
 
     def step(
-        self,
-        double dt_s,
-        double current_a,
-        double motor_position_rad,
-        double motor_velocity_rad_s,
-        double link_position_rad,
-        double temperature_c=NAN,
-        bint network_wanted=True,
+        self, double dt_s, double current_a, double motor_position_rad, double motor_velocity_rad_s,
+        double link_position_rad, double temperature_c=NAN, bint network_wanted=True
     ):
         """Return the `Estimate` at this sample, dt_s [s] after the one before; never raises on any float.
 
@@ -430,13 +424,8 @@ cdef class FusedEstimator(Estimator):
         no_values(out, self.state.guard.status)
         if self.observed:
             update_link(
-                &self.law.link,
-                &self.state.link,
-                &self.law.observer,
-                &self.state.observer,
-                seen.torsion_nm + seen.ahead_nm,
-                x.dt_s,
-                &link,
+                &self.law.link, &self.state.link, &self.law.observer, &self.state.observer, seen.torsion_nm + seen.ahead_nm,
+                x.dt_s, &link
             )
             out.torque_rate_nm_s, out.load_nm = link.rate_nm_s, link.load_nm
             self.estimate(&seen, x, network_wanted, out)

@@ -153,23 +153,12 @@ cdef void update_difference(
 cdef void pause_turn(AgreementState *s) noexcept nogil
 cdef void restart_turn(AgreementState *s) noexcept nogil
 cdef void update_turn(
-    const AgreementLaw *law,
-    AgreementState *s,
-    double dt,
-    double difference,
-    double direction,
-    double velocity,
-    double loss,
-    const double *wave,
+    const AgreementLaw *law, AgreementState *s, double dt, double difference, double direction, double velocity,
+    double loss, const double *wave
 ) noexcept nogil
 cdef bint turn_differs(const AgreementLaw *law, const AgreementState *s) noexcept nogil
 cdef double mismatch_variance(const AgreementState *s, double alpha, double torsion) noexcept nogil
 cdef bint degrades(
-    const AgreementLaw *law,
-    const AgreementState *s,
-    const OffsetState *offsets,
-    double mismatch,
-    double sigma,
-    double alpha,
-    double torsion,
+    const AgreementLaw *law, const AgreementState *s, const OffsetState *offsets, double mismatch, double sigma,
+    double alpha, double torsion
 ) noexcept nogil

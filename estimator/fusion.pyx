@@ -718,14 +718,8 @@ cdef void restart_turn(AgreementState *s) noexcept nogil:
 
 
 cdef void update_turn(
-    const AgreementLaw *law,
-    AgreementState *s,
-    double dt,
-    double difference,
-    double direction,
-    double velocity,
-    double loss,
-    const double *wave,
+    const AgreementLaw *law, AgreementState *s, double dt, double difference, double direction, double velocity,
+    double loss, const double *wave
 ) noexcept nogil:
     """Take a sample in motion: difference of the paths and loss [Nm], and waves of the same age.
 
@@ -861,13 +855,8 @@ cdef double mismatch_variance(const AgreementState *s, double alpha, double tors
 
 
 cdef bint degrades(
-    const AgreementLaw *law,
-    const AgreementState *s,
-    const OffsetState *offsets,
-    double mismatch,
-    double sigma,
-    double alpha,
-    double torsion,
+    const AgreementLaw *law, const AgreementState *s, const OffsetState *offsets, double mismatch, double sigma,
+    double alpha, double torsion
 ) noexcept nogil:
     """Return whether a mismatch [Nm^2], as `mismatch_variance`, degrades the status beside the estimate's own sigma [Nm]."""
     cdef double most = fmax(LOWER_SQUARE * sigma * sigma, law.relevant)
