@@ -86,13 +86,13 @@ cdef struct Samples:  # hashes of the last 256 samples, and where the last one w
     uint64_t words[256]
     uint8_t at[256]
     uint8_t next, lag  # lag: of the run that is followed, 0 for none
-    int run, length, unlike  # samples of it that differ from the one before; all of it; samples that continued none, up to KNOWN_RUNS
+    int run, length, unlike, since  # samples of it that differ from the one before; all of it; that continued none; since a jump
     double usual, weight  # mean length of runs; log(1 + 1/usual)
 
 cdef class Plausibility:
     cdef Samples samples
     cdef double gap_s, per_turn, jump, limit, longest_frozen_s, twist_limit, twist_jump
-    cdef double low, high, motor, twist, current, frozen_from, frozen_s
+    cdef double low, high, motor, twist, current, frozen_from, frozen_s, slip  # slip: largest of late [rad]
     cdef readonly double mismatch_rad
     cdef int check(
         self, double dt_s, double motor_position, double motor_velocity, double link_position, double current

@@ -164,6 +164,28 @@ def test_noise_that_comes_twice_is_found_and_its_chance_is_not(counts: float) ->
         assert REPEATED in found[999 : 999 + 60]
 
 
+@pytest.mark.parametrize("delay", [4, 5, 12])
+def test_of_a_moving_joint_few_samples_that_come_twice_are_found(delay: int) -> None:
+    """Noise of two counts on 1.5 rad/s of the motor: it jumps back, and sends again what it sent before."""
+    rows = [
+        (p + 1.5e-3 * n, v + 1.5, q + 1.5e-5 * n, i) for n, (p, v, q, i) in enumerate(_noisy(4000, 2.0, 3))
+    ]
+    check = checks()
+    assert {check.step(PERIOD_S, *row) for row in rows} == {0}
+    found = [check.step(PERIOD_S, *row) for row in rows[-delay:]]
+    assert REPEATED in found
+    # a jump whose samples are new is none
+    check.reset()
+    assert not any(check.step(PERIOD_S, *row) & REPEATED for row in [*rows[:2000], *rows[2020:]])
+
+
+def test_a_velocity_that_was_far_wrong_is_forgotten_soon() -> None:
+    check = checks()
+    found = [check.step(PERIOD_S, 0.0, 60.0 if n < 800 else 0.0, 0.0, 0.0) for n in range(1200)]
+    assert found[799] == VELOCITY_MISMATCH
+    assert set(found[1050:]) == {0}
+
+
 def test_a_repetition_is_told_by_its_samples_and_not_by_those_that_stand_still() -> None:
     """A joint without noise repeats one sample for ever, or two by turns: nothing is concluded from either."""
     check = checks()
