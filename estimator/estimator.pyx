@@ -21,7 +21,7 @@ from jtqd.estimator.observer cimport (
 )
 from jtqd.estimator.fusion cimport (
     Checkpoint, Fused, Learned, Rest, TURN_WAVES, apart_nm2, at_rest, degrades, drop_block, early_factor, fading,
-    fill_agreement, fill_fusion, fill_offsets, fill_proof, fuse_paths, gather, implausible, keep_offsets, known_nm2,
+    fill_agreement, fill_fusion, fill_offsets, fill_proof, follow_parting, fuse_paths, gather, implausible, keep_offsets, known_nm2,
     local_stiffness, mismatch_variance, offsets_of, pause_turn, possible_error, prove, report_offsets, restart_agreement,
     restart_offsets, restart_proof, restart_turn, reweigh, turn_differs, unproven_nm2, update_difference, update_turn
 )
@@ -47,7 +47,7 @@ from jtqd.estimator.network import FEATURES, check_fit, native_of
 from jtqd.estimator.run import INPUTS, EstimateRun, ObservedRun
 from jtqd.estimator.settings import METHODS, largest_torque_nm
 from jtqd.estimator.status import Estimate
-from jtqd.estimator.fusion import FOREIGN_SIGMAS
+from jtqd.estimator.fusion import FOREIGN_SIGMAS, ONE_WAY
 
 STANDSTILL_SIGMAS: Final = 3.0
 """Half width of the standstill interval in standard deviations, where torsion narrows the interval of friction.
@@ -58,7 +58,7 @@ Of a joint file with section `fused.standstill` only for the disagreement of the
 SLOPE_NM: Final = 0.5
 """Step of the motor torque over which the slope of the loss is taken."""
 
-cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, STEP = SLOPE_NM, FOREIGN = FOREIGN_SIGMAS
+cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, STEP = SLOPE_NM, FOREIGN = FOREIGN_SIGMAS, ONE_SIDED = ONE_WAY
 cdef double DOUBTFUL = 4.0  # tolerances of the inputs: the status is lowered
 cdef double LOWERED_S = 0.1  # the status stays degraded for so long after the paths have disagreed: it must not flicker
 cdef int STARTING = st.STARTING, VALID = st.VALID, DEGRADED = st.DEGRADED, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
@@ -512,6 +512,10 @@ cdef class FusedEstimator(Estimator):
         unproven = prove(&law.proof, &s.proof, &physics, seen, x.dt_s, standing, in_order(&s.inputs))
         if law.offsets.estimated:
             keep_offsets(&s.checkpoint, &s.offsets, in_order(&s.inputs), x.dt_s)
+            if out.status == VALID and fabs(seen.direction) > ONE_SIDED and in_order(&s.inputs):
+                follow_parting(
+                    &law.offsets, &s.checkpoint, &s.offsets, &s.agreement, &physics, fmin(fabs(raw), fabs(seen.torsion_nm)), x.dt_s
+                )
             self.update_path_difference(seen, x, &physics, loss.nm, out.status)
         if law.offsets.spread > 0.0:
             known = known_nm2(&law.offsets, &s.offsets)

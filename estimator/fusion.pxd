@@ -79,7 +79,7 @@ cdef struct OffsetState:
     double day_p[OFFSET_STATES][OFFSET_STATES]
     double link_rad, current_a  # corrections of the readings
     double uncorrected_nm  # known link offset that is not corrected yet, as torque
-    double disagreeing_s  # for how long the paths differ by more than JUMP sigmas
+    float disagreeing_s, parted_nm  # for how long the paths differ by more than JUMP sigmas; least load [Nm] of paths that were apart, 0: not
     uint64_t jumps  # how often a known offset became unknown again
     Block block
 
@@ -90,12 +90,10 @@ cdef struct Estimates:  # of the offsets
 
 cdef struct Checkpoint:
     Estimates kept, recent  # the latter is younger, and not yet known to be of a healthy time
-    double calm_s  # without a fault
+    float calm_s, again_s  # without a fault; for how long paths that were apart agree by `kept`
 
 cdef void keep_offsets(Checkpoint *c, OffsetState *s, bint in_order, double dt) noexcept nogil
-cdef int fill_offsets(
-    OffsetLaw *law, double torque_per_ampere, double rated_nm, fused, bint used, bint estimated
-) except -1
+cdef int fill_offsets(OffsetLaw *law, double torque_per_ampere, double rated_nm, fused, bint used, bint estimated) except -1
 cdef void restart_offsets(const OffsetLaw *law, OffsetState *s) noexcept nogil
 cdef void drop_block(OffsetState *s) noexcept nogil
 cdef bint gather(
@@ -146,6 +144,9 @@ cdef struct AgreementState:
 
 cdef int fill_agreement(AgreementLaw *law, agreement, double rated_nm) except -1
 cdef void restart_agreement(AgreementState *s) noexcept nogil
+cdef void follow_parting(
+    const OffsetLaw *law, Checkpoint *c, OffsetState *s, AgreementState *a, const Fused *fused, double load, double dt
+) noexcept nogil
 cdef void update_difference(
     const OffsetLaw *offset_law, OffsetState *offsets, const AgreementLaw *law, AgreementState *s, double stiffness,
     double slope

@@ -27,7 +27,7 @@ torsion may be off by, a bound of 3 standard deviations in sigma:
     U >= min(range of tau_t, range of tau_t - tau_raw) > tolerance     at rest: the torsion changed, and the current did not
 
 An offset of the link encoder that is beyond DAYS spreads of ordinary days may be one of the current: it counts like U. What the
-torsion has changed by since the sample that the current path is as old as is not compared yet: AHEAD of it counts.
+torsion has changed by since the sample that the current path is as old as is not compared yet: AHEAD of it counts, all while U does.
 
 **Offsets** of the link encoder and of the current on one day are states of a small Kalman filter, whose measurement is the
 difference of the torsion path tau_t and the current path tau_c:
@@ -63,7 +63,8 @@ on the days of the fit (`correlation_s`). The first filter has noise that includ
 slowly; it judges what exceeds ordinary days, and the agreement of the paths.
 
 **Nothing is learned from a fault.** While an encoder is out of order, and a second longer, nothing is learned; with the begin of
-that the offsets go back to those of CALM_S before. Their covariance stays: an encoder that has slipped is learned again.
+that the offsets go back to those of CALM_S before. Their covariance stays: an encoder that has slipped is learned again. A fault
+of current or velocity is seen as paths that are apart: what they agree by again is what was known before (`follow_parting`).
 
 **Agreement** of the paths over seconds: differences beyond those on the runs of the fit count as a mismatch of the joint file.
 A changed stiffness, hysteresis, encoder error or friction shows in the difference long before a single sample is implausible.
@@ -120,7 +121,7 @@ FOREIGN_SIGMAS: Final = 4.0
 GAUSS: Final = 1.6448536269514722
 """Half width of a normal distribution's 90 % interval in standard deviations: the interval is value +- GAUSS sigma."""
 
-cdef double HOLD = HOLD_S, DISAGREE = DISAGREE_SIGMAS, INTERVAL = 1.0 / GAUSS
+cdef double HOLD = HOLD_S, DISAGREE = DISAGREE_SIGMAS, FOREIGN = FOREIGN_SIGMAS, INTERVAL = 1.0 / GAUSS
 cdef double BOUNDING = 3.0, PER_BOUND = 1.0 / BOUNDING**2  # standard deviations of a bound
 cdef double PROVING_S = 0.1  # in which paths that agree prove the torsion
 cdef double RESTING_SHARE = 0.025  # of the rated torque, by which the torsion changes at rest from noise
@@ -265,6 +266,8 @@ cdef double prove(
         s.unproven *= PROVING_S / (PROVING_S + dt)
     most = fmin(law.most, possible_error(fused))
     s.unproven = fmin(s.unproven, most)
+    if not standing:  # what is ahead has not been compared, either
+        return s.unproven + fabs(seen.ahead_nm) * fmin(s.unproven / law.tolerance, 1.0)
     return fmax(s.unproven, fmin(now, most + fabs(seen.ahead_nm))) if now > law.tolerance else s.unproven
 
 
@@ -343,7 +346,7 @@ cdef double SHRUNK_BELOW = 2.0, KEPT_ABOVE = 4.0, INVERSE_RANGE = 1.0 / (KEPT_AB
 # the file's sigma needs no correction
 cdef double COVERED = 0.5
 cdef double SLEW_S = 0.25, INVERSE_SLEW = 1.0 / SLEW_S
-cdef double CALM_S = 1.0  # without a fault, until what was learned before counts as learned from healthy inputs
+cdef double CALM_S = 1.0, AGAIN_S = 0.5  # without a fault, until what was learned is of healthy inputs; of paths that agree again
 cdef double LARGEST_LINK = 0.3  # prior standard deviation of the link offset as a torque, part of the rated torque
 cdef double CURRENT_SHARE = 0.2  # of the current offset as a torque, part of the current path's: the rest is friction
 cdef double LEAST_GAIN = 0.03  # least one of the gain
@@ -418,20 +421,51 @@ cdef Estimates _estimates(const OffsetState *s) noexcept nogil:
     return e
 
 
+cdef void _go_back(Checkpoint *c, OffsetState *s) noexcept nogil:
+    c.recent, c.calm_s = c.kept, 0.0
+    memcpy(s.x, c.kept.x, sizeof(s.x))
+    memcpy(s.day_x, c.kept.day_x, sizeof(s.day_x))
+    s.link_rad, s.current_a = c.kept.link_rad, c.kept.current_a
+    drop_block(s)
+
+
 cdef void keep_offsets(Checkpoint *c, OffsetState *s, bint in_order, double dt) noexcept nogil:
     """Keep offsets of a time that no fault has followed within CALM_S; with the begin of a fault go back to them."""
     if in_order:
         c.calm_s += dt
-        if c.calm_s > CALM_S:
+        if c.calm_s > CALM_S and s.parted_nm == 0.0:
             c.kept, c.recent = c.recent, _estimates(s)
             c.calm_s = dt
     elif c.calm_s > 0.0:
-        c.calm_s = 0.0
-        c.recent = c.kept
-        memcpy(s.x, c.kept.x, sizeof(s.x))
-        memcpy(s.day_x, c.kept.day_x, sizeof(s.day_x))
-        s.link_rad, s.current_a = c.kept.link_rad, c.kept.current_a
-        drop_block(s)
+        _go_back(c, s)
+
+
+cdef void follow_parting(
+    const OffsetLaw *law, Checkpoint *c, OffsetState *s, AgreementState *a, const Fused *fused, double load, double dt
+) noexcept nogil:
+    """Take a sample in motion: go back to the offsets of before the paths were apart, where these agree by them again.
+
+    Under at least the smallest load [Nm] that they were apart with: there a joint that has changed does not agree. For AGAIN_S more
+    with what was learned since not in agreement, or a mismatch that the paths do not show, than without.
+    """
+    cdef double change = law.stiffness * (c.kept.link_rad - s.link_rad), square = FOREIGN * FOREIGN * fused.variance
+    if fused.difference * fused.difference > square:
+        s.parted_nm = fmax(load if s.parted_nm == 0.0 else fmin(s.parted_nm, load), 1e-6)
+    if s.parted_nm == 0.0:
+        return
+    change += law.torque_per_ampere * (c.kept.current_a - s.current_a)
+    if fabs(fused.difference + change) > reach(fused, DISAGREE):
+        c.again_s = 0.0
+    elif load >= s.parted_nm:
+        c.again_s += dt if a.mismatch > square or fabs(fused.difference) > reach(fused, DISAGREE) else -dt
+    if fabs(c.again_s) < AGAIN_S:
+        return
+    if c.again_s > 0.0:
+        _go_back(c, s)
+        a.trend = a.slow = a.fast = a.mismatch = a.gain_mismatch = a.turn.square = 0.0
+        memset(a.turn.z, 0, sizeof(a.turn.z))  # X'X is of the motion, not of the difference
+    s.parted_nm, c.again_s, c.calm_s = 0.0, 0.0, 0.0
+    c.kept = c.recent = _estimates(s)
 
 
 cdef void drop_block(OffsetState *s) noexcept nogil:

@@ -280,6 +280,18 @@ def run_of(v: FloatArray, difference_nm: FloatArray, torsion_nm: FloatArray) -> 
     )
 
 
+def test_what_the_torsion_is_ahead_by_counts_whole_until_it_is_proven() -> None:
+    """3 Nm ahead, a bound of three standard deviations, as the rest of U; afterwards a twentieth."""
+    assert USUAL.fused is not None
+    run = run_of(np.full(3000, 1.0), np.zeros(3000), np.full(3000, 5.0))
+    alpha, *_, more, _ = track_run(USUAL.fused, USUAL.rated_torque_nm, *run, False)
+    ahead = (*run[:10], run[10] + 3.0, run[11])
+    wider = track_run(USUAL.fused, USUAL.rated_torque_nm, *ahead, False)[4]
+    bound = (wider[0] - (0.05 * 3.0) ** 2) ** 0.5 - more[0] ** 0.5
+    assert bound == pytest.approx(alpha[0] * 3.0 / 3.0, rel=1e-3)
+    assert wider[-1] - more[-1] == pytest.approx((0.05 * 3.0) ** 2, rel=1e-3)
+
+
 def test_what_is_not_yet_taken_off_is_not_known() -> None:
     n = 4000
     v = 1.2 * np.sin(2.5e-3 * np.arange(n) + 0.4)
@@ -461,6 +473,21 @@ def test_great_doubt_lowers_the_status() -> None:
     assert np.mean(found.status[2000:][moving] == st.DEGRADED) > 0.9
     usual, _ = judged()
     assert np.mean(usual.status[200:] == st.DEGRADED) < 0.01
+
+
+@pytest.mark.parametrize("frozen", [1, 3])
+def test_what_was_learned_from_a_current_or_a_velocity_at_fault_is_forgotten(frozen: int) -> None:
+    """It stands still for a second of motion; a second after its end all is as if it had not been."""
+    columns, _ = driven(8.0, link_zero_rad=1e-4)
+    broken = [each.copy() for each in columns]
+    broken[frozen][4000:5000] = broken[frozen][4000]
+    usual, zeros = tracked(columns, USUAL)
+    found, after = tracked(tuple(broken), USUAL)
+    assert np.isin(found.status[4000:5000], (st.DEGRADED, st.STANDSTILL, st.INVALID)).mean() > 0.3
+    late = slice(6000, None)
+    assert after.link_used_rad == pytest.approx(zeros.link_used_rad, abs=1e-5)
+    assert np.mean(found.status[late] != usual.status[late]) < 0.01
+    assert np.nanmax(found.sigma_nm[late] / usual.sigma_nm[late]) < 1.5
 
 
 def test_a_doubt_that_ordinary_days_have_lowers_no_status_and_widens_sigma_as_before() -> None:
@@ -784,7 +811,7 @@ def learned(joint: Joint = NARROW, settings: EstimatorSettings = ON) -> Estimato
 def test_the_layout_of_the_past_is_the_one_of_its_number() -> None:
     """Where this fails, what logs hold means something else: count `PAST_LAYOUT` up, then change the size here."""
     size = len(FusedEstimator(NARROW, ON).past)
-    assert (PAST_LAYOUT, size) == (11, 2112)
+    assert (PAST_LAYOUT, size) == (12, 2112)
     assert size <= 8 * PAST_WORDS, "snapshot and log have room for it"
 
 
