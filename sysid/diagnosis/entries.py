@@ -147,7 +147,9 @@ def usage(signals: Sequence[JointSignals]) -> Usage:
     speed = math.sqrt(float(np.mean(np.concatenate([s.state.velocity_rad_s**2 for s in signals]))))
     warm = np.concatenate([s.state.temperature_c for s in signals])
     warm = warm[np.isfinite(warm)]
-    return Usage(speed, float(np.ptp(warm)) if len(warm) else 0.0)
+    slow = np.concatenate([s.highest_order()[s.usable(MOTOR)] for s in signals])
+    order = float(np.quantile(slow, 1.0 - limits.SEEN)) if len(slow) else math.inf
+    return Usage(speed, float(np.ptp(warm)) if len(warm) else 0.0, order)
 
 
 _WARMS_K: Final = 1.0
@@ -165,6 +167,8 @@ def entry_of(
     if _sizes(c) > 1:
         return None
     if use.warming_k < _WARMS_K and "temperature_c" in fields_used(effect, p, joint):
+        return None
+    if p.get("order_per_motor_rev", 0.0) > use.order:
         return None
     referred = "reference_c" in p and c.size == 2
     step = p[lead] if referred or (c.size > 1 and "phase_rad" in p) else p[lead] - nothing[lead]

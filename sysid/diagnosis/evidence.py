@@ -17,22 +17,22 @@ entry as it nevertheless resembles is a second, small prior of every entry (Geor
 needs more evidence than such a discrepancy would give it.
 
 The response of each balance has weight one, so no set gains by scaling a balance. What noise of torques and motion puts into
-the columns is taken out of the normal equations (Fuller 1987, Measurement Error Models); no set explains more than there is.
+the columns is taken out of the normal equations (Fuller 1987, Measurement Error Models), once for all sets.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.entries import Entry
 from jtqd.sysid.diagnosis.regressors import Index
@@ -40,16 +40,16 @@ from jtqd.sysid.diagnosis.regressors import Index
 Set = frozenset[int]
 """Numbers of entries."""
 Variances = Mapping[object, float]
-Solved = TypeVar("Solved")
 _LESS: Final = 1e-6
 _TRIED: Final = 3
 """Additions that are tried at each step, those of largest gain."""
 _RIVAL_STEPS: Final = 12
 _SAME: Final = 0.05
 """Part of a column's energy that others may lack, and still add up to it."""
-_LITTLE: Final = 0.1
 _NOISY: Final = 0.5
-"""Part of a column's energy that its noise may be."""
+"""Part of the energy of a direction of the columns that its noise may be."""
+_ALIKE: Final = 1e-10
+"""Part of their energy below which columns differ by rounding."""
 
 
 @dataclass(frozen=True)
@@ -130,9 +130,9 @@ class Sets:
     """Sets of entries on marginal normal equations A [E + 1, E + 1], last: the response."""
 
     def __init__(
-        self, entries: Sequence[Entry], gram: FloatArray, out: Set = frozenset(), noise: Scatter | None = None
+        self, entries: Sequence[Entry], gram: FloatArray, noise: Scatter | None = None
     ) -> None:
-        self.entries, self.gram, self.out = list(entries), gram, out
+        self.entries, self.gram = list(entries), gram
         self.noise = noise or Scatter(np.zeros_like(gram), 1.0)
         self.slices: list[Index] = [np.arange(s.start, s.stop) for s in slices_of(entries)]
         one = np.array([e.size == 1 for e in entries], bool)
@@ -174,15 +174,10 @@ class Sets:
         at = self.columns(chosen)
         inner = self.gram[np.ix_(at, at)] + np.eye(len(at))
         right = self.gram[at, -1]
-        try:
-            factor = cho_factor(inner)
-        except np.linalg.LinAlgError:
-            return Fit(np.zeros(len(at)), np.eye(len(at)), -math.inf)
+        factor = cho_factor(inner)
         mean = _within(inner, right, *_bounds(self.entries, chosen))
         covariance = cho_solve(factor, np.eye(len(at)))
         explained = float(2.0 * mean @ right - mean @ inner @ mean)
-        if explained >= self.gram[-1, -1]:  # more than there is: what is taken out as noise is none
-            return Fit(mean, covariance, -math.inf)
         explained -= self.noise.by_chance(self._spread(chosen, mean))
         evidence = 0.5 * explained - float(np.sum(np.log(np.diag(factor[0]))))
         return Fit(mean, covariance, evidence + sum(self.entries[k].odds for k in chosen))
@@ -203,7 +198,7 @@ class Sets:
         response = self.gram[:, -1] - cross @ now.mean  # with the bounds that the set is at
         taken = {self.entries[k].slot for k in chosen}
         free = np.array(
-            [k not in chosen | self.out and e.slot not in taken for k, e in enumerate(self.entries)], bool
+            [k not in chosen and e.slot not in taken for k, e in enumerate(self.entries)], bool
         )
         if len(self._single):
             precision = rest[self._place, self._place] + 1.0
@@ -250,7 +245,7 @@ class Sets:
         deviation = np.sqrt(np.diag(fit.covariance))
         out = []
         for k, j in zip(self._single.tolist(), self._place.tolist(), strict=True):
-            if k in chosen | self.out or self.entries[k].slot in taken:
+            if k in chosen or self.entries[k].slot in taken:
                 continue
             shared = fit.covariance @ self.gram[at, j]
             if self.gram[j, j] - self.gram[at, j] @ shared > _SAME * self.gram[j, j]:
@@ -306,16 +301,36 @@ class Sets:
         ]
 
 
-def _mostly(noise: FloatArray, grams: FloatArray) -> BoolArray:
-    """Return the columns that are noise for the most part, as a rate of a noisy torque is [..., E + N + 1]."""
-    return np.asarray(np.diagonal(noise, 0, -2, -1) > _NOISY * np.diagonal(grams, 0, -2, -1), np.bool_)
+def without_noise(gram: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return normal equations over [columns, response] without what noise puts into them, of all but the response's square.
+
+    A direction of the columns that is noise for the most part is none: there a coefficient would explain noise. Directions
+    are those in which neither energy nor noise is correlated, so it does not matter which columns span them.
+    """
+    energy = np.diag(gram)[:-1]
+    scale = 1.0 / np.sqrt(np.where(energy > 0.0, energy, np.inf))
+    values, vectors = np.linalg.eigh(gram[:-1, :-1] * scale[:, None] * scale)
+    seen = values > _ALIKE
+    white = scale[:, None] * vectors[:, seen] / np.sqrt(values[seen])
+    part, turn = np.linalg.eigh(white.T @ noise[:-1, :-1] @ white)
+    white = white @ turn[:, part < _NOISY]
+    part = np.maximum(part[part < _NOISY], 0.0)
+    back = gram[:-1, :-1] @ white
+    response = white.T @ (gram[:-1, -1] - noise[:-1, -1])
+    most = float(np.sum(response**2 / (1.0 - part)))  # no direction explains more than there is
+    response *= min(1.0, math.sqrt(gram[-1, -1] / most)) if most > 0.0 else 1.0
+    out = np.empty_like(gram)
+    out[:-1, :-1] = back * (1.0 - part) @ back.T
+    out[:-1, -1] = out[-1, :-1] = back @ response
+    out[-1, -1] = gram[-1, -1]
+    return out
 
 
 class Equations:
     """Whitened normal equations of all recordings over [entries' columns E | nuisances N | response].
 
     grams: per recording; noise: what the noise of torques puts into them; groups: of the variance of each nuisance; shared:
-    which nuisances are discrepancy, with a part that all runs have in common. What is mostly noise is none, nor an entry.
+    which nuisances are discrepancy, with a part that all runs have in common.
     """
 
     def __init__(  # noqa: PLR0917
@@ -332,7 +347,8 @@ class Equations:
     ) -> None:
         self.entries, self.groups, self.shared = list(entries), groups, shared
         self.recorded = np.zeros(sum(e.size for e in entries)) if recorded is None else recorded
-        self.plain, self.noise, self.start, self.most = grams, noise, start, most
+        self.plain, self.start, self.most = grams.sum(axis=0), start, most
+        self.grams = np.array([without_noise(*each) for each in zip(grams, noise, strict=True)])
         self.E, self.N = sum(e.size for e in entries), len(groups)
         self.kinds = sorted(set(groups), key=str)
         self.member = {g: np.array([k for k, h in enumerate(groups) if h == g], np.intp) for g in self.kinds}
@@ -340,10 +356,7 @@ class Equations:
         self._outer = np.concatenate((np.arange(self.E), self.E + shared, [self.E + self.N])).astype(np.intp)
         sides = np.append(np.arange(self.E), self.E + self.N)
         self.scatter = Scatter(noise.sum(axis=0)[np.ix_(sides, sides)], rows)
-        much = _mostly(noise.sum(axis=0), grams.sum(axis=0))
-        self.noisy = frozenset(k for k, s in enumerate(slices_of(entries)) if much[s].any())
         self.turned = np.empty((0, len(shared)))
-        self._take_out(1.0)
         self.resemblance = self._resemblance()
 
     def _resemblance(self) -> dict[object, FloatArray]:
@@ -353,27 +366,16 @@ class Equations:
         many = {g: [self.E + k for k in self.shared.tolist() if self.groups[k] == g] for g in self.most}
         return {g: np.sum((total[f, : self.E] / energy) ** 2, axis=0) for g, f in many.items()}
 
-    def _take_out(self, kappa: float) -> None:
-        self.kappa = kappa
-        self.grams = self.plain - kappa * self.noise
-        self.grams[:, -1, -1] = self.plain[:, -1, -1]
-        seen = ~_mostly(self.noise, self.plain)
-        seen[:, : self.E], seen[:, -1] = True, True
-        self.grams *= seen[:, :, None] & seen[:, None, :]
-
     def beside(self, chosen: Set) -> Equations:
         """Return the equations with a discrepancy that has no part along the columns of a set: what a set explains is no
         discrepancy (Plumlee 2017, J. Am. Stat. Assoc. 112). `turned`: what is taken off, per coefficient of the set [q, k].
         """
         at, f = columns_of(self.entries, chosen), self.E + self.shared
-        total = self.plain.sum(axis=0)
         out = copy(self)
-        out.turned = np.linalg.solve(total[np.ix_(at, at)] + np.eye(len(at)), total[np.ix_(at, f)])
-        out.plain, out.noise = self.plain.copy(), self.noise.copy()
-        for each in (out.plain, out.noise):
-            each[:, :, f] -= each[:, :, at] @ out.turned
-            each[:, f, :] -= out.turned.T @ each[:, at, :]
-        out._take_out(self.kappa)
+        out.turned = np.linalg.solve(self.plain[np.ix_(at, at)] + np.eye(len(at)), self.plain[np.ix_(at, f)])
+        out.grams = self.grams.copy()
+        out.grams[:, :, f] -= out.grams[:, :, at] @ out.turned
+        out.grams[:, f, :] -= out.turned.T @ out.grams[:, at, :]
         return out
 
     def first(self) -> dict[object, float]:
@@ -384,13 +386,10 @@ class Equations:
     def sets(self, variances: Variances, chosen: Set = frozenset(), *, resembling: bool = True) -> Sets:
         """Return the sets at these variances, with the discrepancy beside a set; resembling: and what resembles any."""
 
-        def marginal(e: Equations) -> FloatArray:
-            here = e.beside(chosen)
-            return here._without_shared(np.sum(here._reduced(variances)[0], axis=0), variances)[0]
-
-        gram = self._positive(marginal)
+        here = self.beside(chosen)
+        gram = here._without_shared(np.sum(here._reduced(variances)[0], axis=0), variances)[0]
         gram = self._without_resemblance(gram, variances) if resembling else gram
-        return Sets(self.entries, gram, self.noisy, self.scatter)
+        return Sets(self.entries, gram, self.scatter)
 
     def deviation(self, variances: Variances) -> FloatArray:
         """Return the prior deviation of coefficients outside of a set [E]: as the recording makes them and the discrepancy
@@ -404,12 +403,9 @@ class Equations:
     def marginal(self, variances: Variances) -> list[FloatArray]:
         """Return the equations over [E, response] of all recordings but each in turn, and of all."""
 
-        def marginals(e: Equations) -> list[FloatArray]:
-            parts = np.array(e._reduced(variances)[0])
-            totals = [*(parts.sum(axis=0) - parts), parts.sum(axis=0)]
-            return [e._without_shared(total, variances)[0] for total in totals]
-
-        return self._positive(marginals)
+        parts = np.array(self._reduced(variances)[0])
+        totals = [*(parts.sum(axis=0) - parts), parts.sum(axis=0)]
+        return [self._without_shared(total, variances)[0] for total in totals]
 
     def _without_resemblance(self, gram: FloatArray, variances: Variances) -> FloatArray:
         """Return the equations over [E, response] without what of the discrepancy resembles the entries; of directions in
@@ -462,21 +458,7 @@ class Equations:
         self, chosen: Set, variances: Variances, steps: int
     ) -> tuple[dict[object, float], float, Means]:
         """Return the variances after `steps` for a set, -2 log marginal likelihood there, and means."""
-        return self._positive(lambda e: e.beside(chosen)._expected(chosen, variances, steps))
-
-    def _positive(self, solve: Callable[[Equations], Solved]) -> Solved:
-        """Return what these equations give; noise is known to its scatter, so less of it is taken out where no covariance
-        is left.
-        """
-        here = self
-        while True:
-            try:
-                return solve(here)
-            except np.linalg.LinAlgError:
-                if here.kappa <= 0.0:
-                    raise
-                here = copy(here)
-                here._take_out(0.5 * here.kappa if here.kappa > _LITTLE else 0.0)
+        return self.beside(chosen)._expected(chosen, variances, steps)
 
     def _expected(
         self, chosen: Set, variances: Variances, steps: int
@@ -495,8 +477,6 @@ class Equations:
             covariance = np.linalg.inv(inner)
             theta = _within(inner, total[q, -1], low, high)
             left = float(total[-1, -1] - 2.0 * theta @ total[q, -1] + theta @ inner @ theta)
-            if left <= 0.0:
-                raise np.linalg.LinAlgError("found more explained than there is")
             score = left + logs + 2.0 * float(np.sum(np.log(np.diag(lower)))) + float(np.sum(np.log(w)))
             score -= 2.0 * sum(self.entries[k].odds for k in chosen)
             contrast = np.zeros(e + many + 1)

@@ -7,6 +7,7 @@ search, are defined where they are used.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
@@ -16,10 +17,13 @@ from jtqd.estimator.joint import Joint
 
 @dataclass(frozen=True)
 class Usage:
-    """What the runs of a joint are like: rms speed [rad/s, joint side], range of temperature [K]."""
+    """What the runs of a joint are like: rms speed [rad/s, joint side], range of temperature [K], highest order of the motor
+    that is slow enough to be seen in SEEN of the motion.
+    """
 
     speed_rad_s: float
     warming_k: float
+    order: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -127,6 +131,8 @@ SURE: Final = 3.0
 """Standard deviations by which a certain entry differs from none."""
 AGREE: Final = 0.06
 """Standard error of the mean size of a certain entry over the runs, part of it; runs are what is independent."""
+SEEN: Final = 0.05
+"""Part of the motion in which a wave must be slow enough to be seen; what few moments show of one, anything may be."""
 UNTOLD: Final = 0.7
 """Posterior over prior deviation above which these runs cannot tell a value."""
 LISTED: Final = 0.2

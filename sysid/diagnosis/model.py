@@ -195,7 +195,7 @@ def solve(dataset: Dataset) -> Solution:
             noise = noise_of_channels(residuals, dataset.step_s, limits.FLOOR * dataset.rated_torque_nm)
         equations = work.equations(noise)
         search = _Search(equations)
-        starts = [start - equations.noisy, *([frozenset[int]()] if turn < _FROM_NOTHING else [])]
+        starts = [start, *([frozenset[int]()] if turn < _FROM_NOTHING else [])]
         best = search.best(starts, rivals=turn + 1 == _TURNS)
         start, variances, means = best.chosen, best.variances, best.means
         residuals = work.left(start, means)

@@ -248,6 +248,12 @@ class JointSignals:
         """Return what of a twist [n] is as slow as a torque is known."""
         return angle if self.torsion_nm is None else below(angle, self.step_s, self.torque_hz)
 
+    def highest_order(self) -> FloatArray:
+        """Return the order of the motor whose wave is as quick as what these balances hold, at each sample [n]."""
+        hz = min(self.visible.highest_hz, 0.25 / self.step_s)
+        turns = np.abs(self.joint.gear_ratio * self.state.velocity_rad_s) / (2.0 * math.pi)
+        return np.asarray(hz / np.maximum(turns, 1e-12))
+
     def visible_share_of(self, order_per_motor_rev: float) -> FloatArray:
         """Return `visible_share` [n] of a wave of this order; that of the last order is kept."""
         if order_per_motor_rev not in self._shares:

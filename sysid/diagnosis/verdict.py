@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -25,7 +25,7 @@ from jtqd.estimator.effects.effect import TORSION, Effect, Values
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.entries import Entry, present_effects
-from jtqd.sysid.diagnosis.evidence import Set, Sets
+from jtqd.sysid.diagnosis.evidence import Set, Sets, without_noise
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
@@ -94,13 +94,13 @@ def predict(solution: Solution) -> Prediction:
         chosen -= {worst}
     slots = {solution.entries[k].slot for k in chosen}
     values = {k for k, e in enumerate(solution.entries) if e.prior.file and e.slot not in slots}
-    wide = chosen | values - solution.equations.noisy
+    wide = chosen | values
     part = stacked(grams, without, chosen, wide) if len(grams) > 1 else 0.0
     mixed = [_coefficients(sets, chosen) + part * _added(sets, chosen, wide) for sets in without]
     contrasts = [np.append(-mean, 1.0) for mean in mixed[:-1]]
     each = list(zip(grams, contrasts, counts, strict=True))
     squares = {
-        c: np.array([(g[c][-1, -1], max(float(x @ g[c] @ x), 0.0), count[c]) for g, x, count in each])
+        c: np.array([(g[c][-1, -1], float(x @ g[c] @ x), count[c]) for g, x, count in each])
         for c in grams[0]
     }
     named = wide if part > 0.0 else chosen
@@ -182,6 +182,7 @@ def _grams(solution: Solution) -> tuple[list[dict[Channel, FloatArray]], list[di
     pieces = solution.dataset.recordings
     channels = list(solution.runs[0].channels)
     grams = [{c: np.zeros((weights.shape[1] + 1,) * 2) for c in channels} for _ in range(max(pieces) + 1)]
+    extra = deepcopy(grams)
     counts = [dict.fromkeys(channels, 0) for _ in grams]
     noisy = {run.name: run for run in solution.disturbed}
     for r, run in enumerate(solution.runs):
@@ -191,10 +192,9 @@ def _grams(solution: Solution) -> tuple[list[dict[Channel, FloatArray]], list[di
             grams[pieces[r]][c] += x.T @ x
             if run.name in noisy:
                 noise = _rows(noisy[run.name], c, weights, run) - x
-                extra = noise.T @ noise
-                extra[-1, -1] = 0.0
-                grams[pieces[r]][c] -= extra
-    return grams, counts
+                extra[pieces[r]][c] += noise.T @ noise
+    clean = [{c: without_noise(g, e[c]) for c, g in of.items()} for of, e in zip(grams, extra, strict=True)]
+    return clean, counts
 
 
 def _rows(run: RunData, channel: Channel, weights: FloatArray, valid_of: RunData | None = None) -> FloatArray:
@@ -496,7 +496,7 @@ def entry_table(
     """
     sets, chosen = solution.sets, solution.chosen
     gains = sets.gains(chosen)
-    untold = set(sets.untold(chosen)) | set(solution.equations.noisy)
+    untold = set(sets.untold(chosen))
     there = {(c.name, c.joint): c for c in causes}
     of: dict[tuple[str, JointName], list[int]] = {}
     for k, e in enumerate(sets.entries):

@@ -12,7 +12,7 @@ from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.dataset import library_candidates, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.entries import Entry, entries_of, lead_of, usage
+from jtqd.sysid.diagnosis.entries import Entry, entries_of, entry_of, lead_of, usage
 from jtqd.sysid.diagnosis.findings import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.limits import PRIORS, Usage
 from jtqd.sysid.diagnosis.model import recorded
@@ -178,6 +178,28 @@ def test_a_scaled_coefficient_of_one_is_the_size_of_the_prior(scale: float) -> N
         lead = lead_of(e.candidate)
         changed, file = e.values(np.array([1.0]))[lead], e.values(np.array([0.0]))[lead]
         assert abs(changed - file) == pytest.approx(PRIORS[e.kind].size(joint, use), rel=1e-3), e.kind
+
+
+def test_a_wave_that_turns_too_fast_to_be_seen_is_no_entry(plain: Runs) -> None:
+    """In a twentieth of the motion it must be slower than what the runs resolve."""
+    signals, _ = usable_signals(plain, {1: ARM}, (1,))
+    mine = [s for run in signals for s in run]
+    highest = usage(mine).order
+    seen = [
+        highest * ARM.gear_ratio * np.abs(s.state.velocity_rad_s)
+        < 2.0 * np.pi * min(s.visible.highest_hz, 0.25 / s.step_s)
+        for s in mine
+    ]
+    moving = np.concatenate([x[s.usable("motor")] for x, s in zip(seen, mine, strict=True)])
+    assert np.mean(moving) == pytest.approx(0.05, abs=0.005)
+    library = library_candidates(signals, {1: ARM}, EVERYTHING)
+    [cogging] = [
+        c
+        for c in library
+        if c.effect.name == "cogging" and c.term.basis[0]["order_per_motor_rev"] == 24.0
+    ]
+    assert entry_of(cogging, ARM, replace(USE, order=23.0), 1, {}) is None
+    assert entry_of(cogging, ARM, replace(USE, order=25.0), 1, {}) is not None
 
 
 def test_values_of_the_file_have_better_odds_than_structure(plain: Runs) -> None:
