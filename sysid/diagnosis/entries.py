@@ -35,6 +35,10 @@ _MOST_STEPS: Final = 8
 _DRAWS: Final = 20
 _MOST_CURRENT: Final = 4.0
 """Of the largest current that the file alone draws."""
+_NO_STEP: Final = 1e-6
+"""Of that: smaller steps of the current are none."""
+_SLOPES: Final = -4.0, -0.5
+"""Of what is lacking over the current: -1 where effects see no current."""
 _TORSION_STEP: Final = 1e-4
 """Of the twist at the rated torque: smaller steps of the torsion are none."""
 _SOFTEST: Final = 0.1
@@ -240,9 +244,15 @@ def set_state(s: JointSignals, present: Sequence[Present]) -> None:
     rest = s.demand_nm + _sum(s, [p for p in mine if p not in acting], MOTOR)
     s.state.current_a = rest / s.nm_per_a
     most = _MOST_CURRENT * float(np.max(np.abs(rest), initial=0.0)) / s.nm_per_a
-    for _ in range(_DRAWS if acting else 0):  # damped: a constant twice as large would swing for ever
-        drawn = (rest + _sum(s, acting, MOTOR)) / s.nm_per_a
-        s.state.current_a = np.clip(0.5 * (s.state.current_a + drawn), -most, most)
+    before, lack = s.state.current_a, np.zeros(len(s.time_s))
+    for _ in range(_DRAWS if acting else 0):  # secants: what is drawn falls or rises with the current of its own moment
+        last, lack = lack, (rest + _sum(s, acting, MOTOR)) / s.nm_per_a - s.state.current_a
+        moved = s.state.current_a - before
+        slope = np.divide(lack - last, moved, out=np.full(len(moved), -1.0), where=np.abs(moved) > _NO_STEP * most)
+        before = s.state.current_a
+        s.state.current_a = np.clip(before - lack / np.clip(slope, *_SLOPES), -most, most)
+        if float(np.max(np.abs(lack))) < _NO_STEP * most:
+            break
     s.state.current_rate_a_s = first_difference(s.state.current_a, s.time_s)
 
 
