@@ -129,9 +129,7 @@ class Scatter(NamedTuple):
 class Sets:
     """Sets of entries on marginal normal equations A [E + 1, E + 1], last: the response."""
 
-    def __init__(
-        self, entries: Sequence[Entry], gram: FloatArray, noise: Scatter | None = None
-    ) -> None:
+    def __init__(self, entries: Sequence[Entry], gram: FloatArray, noise: Scatter | None = None) -> None:
         self.entries, self.gram = list(entries), gram
         self.noise = noise or Scatter(np.zeros_like(gram), 1.0)
         self.slices: list[Index] = [np.arange(s.start, s.stop) for s in slices_of(entries)]
@@ -197,9 +195,7 @@ class Sets:
         rest = self.gram - cross @ (now.covariance @ cross.T)
         response = self.gram[:, -1] - cross @ now.mean  # with the bounds that the set is at
         taken = {self.entries[k].slot for k in chosen}
-        free = np.array(
-            [k not in chosen and e.slot not in taken for k, e in enumerate(self.entries)], bool
-        )
+        free = np.array([k not in chosen and e.slot not in taken for k, e in enumerate(self.entries)], bool)
         if len(self._single):
             precision = rest[self._place, self._place] + 1.0
             b = response[self._place]
@@ -301,8 +297,9 @@ class Sets:
         ]
 
 
-def without_noise(gram: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return normal equations over [columns, response] without what noise puts into them, of all but the response's square.
+def without_noise(gram: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return normal equations over [columns, response] without what noise puts into them, of all but the response's square,
+    and what was taken out.
 
     A direction of the columns that is noise for the most part is none: there a coefficient would explain noise. Directions
     are those in which neither energy nor noise is correlated, so it does not matter which columns span them.
@@ -319,11 +316,15 @@ def without_noise(gram: FloatArray, noise: FloatArray) -> FloatArray:
     response = white.T @ (gram[:-1, -1] - noise[:-1, -1])
     most = float(np.sum(response**2 / (1.0 - part)))  # no direction explains more than there is
     response *= min(1.0, math.sqrt(gram[-1, -1] / most)) if most > 0.0 else 1.0
-    out = np.empty_like(gram)
-    out[:-1, :-1] = back * (1.0 - part) @ back.T
-    out[:-1, -1] = out[-1, :-1] = back @ response
-    out[-1, -1] = gram[-1, -1]
-    return out
+    clean, taken = np.empty_like(gram), np.empty_like(gram)
+    for each, square, last in (
+        (clean, 1.0 - part, response),
+        (taken, part, white.T @ noise[:-1, -1]),
+    ):
+        each[:-1, :-1] = back * square @ back.T
+        each[:-1, -1] = each[-1, :-1] = back @ last
+    clean[-1, -1], taken[-1, -1] = gram[-1, -1], noise[-1, -1]
+    return clean, taken
 
 
 class Equations:
@@ -348,14 +349,14 @@ class Equations:
         self.entries, self.groups, self.shared = list(entries), groups, shared
         self.recorded = np.zeros(sum(e.size for e in entries)) if recorded is None else recorded
         self.plain, self.start, self.most = grams.sum(axis=0), start, most
-        self.grams = np.array([without_noise(*each) for each in zip(grams, noise, strict=True)])
+        parts = [without_noise(*each) for each in zip(grams, noise, strict=True)]
+        self.grams, self.noise = (np.array(x) for x in zip(*parts, strict=True))
         self.E, self.N = sum(e.size for e in entries), len(groups)
         self.kinds = sorted(set(groups), key=str)
         self.member = {g: np.array([k for k, h in enumerate(groups) if h == g], np.intp) for g in self.kinds}
         self._inner = np.arange(self.E, self.E + self.N)
         self._outer = np.concatenate((np.arange(self.E), self.E + shared, [self.E + self.N])).astype(np.intp)
-        sides = np.append(np.arange(self.E), self.E + self.N)
-        self.scatter = Scatter(noise.sum(axis=0)[np.ix_(sides, sides)], rows)
+        self.rows = rows
         self.turned = np.empty((0, len(shared)))
         self.resemblance = self._resemblance()
 
@@ -373,9 +374,10 @@ class Equations:
         at, f = columns_of(self.entries, chosen), self.E + self.shared
         out = copy(self)
         out.turned = np.linalg.solve(self.plain[np.ix_(at, at)] + np.eye(len(at)), self.plain[np.ix_(at, f)])
-        out.grams = self.grams.copy()
-        out.grams[:, :, f] -= out.grams[:, :, at] @ out.turned
-        out.grams[:, f, :] -= out.turned.T @ out.grams[:, at, :]
+        out.grams, out.noise = self.grams.copy(), self.noise.copy()
+        for each in (out.grams, out.noise):
+            each[:, :, f] -= each[:, :, at] @ out.turned
+            each[:, f, :] -= out.turned.T @ each[:, at, :]
         return out
 
     def first(self) -> dict[object, float]:
@@ -387,9 +389,11 @@ class Equations:
         """Return the sets at these variances, with the discrepancy beside a set; resembling: and what resembles any."""
 
         here = self.beside(chosen)
-        gram = here._without_shared(np.sum(here._reduced(variances)[0], axis=0), variances)[0]
+        parts, _, keep = here._reduced(variances)
+        total = np.sum(parts, axis=0)
+        gram, scatter = here._without_shared(total, variances)[0], here._scatter(total, keep, variances)
         gram = self._without_resemblance(gram, variances) if resembling else gram
-        return Sets(self.entries, gram, self.scatter)
+        return Sets(self.entries, gram, scatter)
 
     def deviation(self, variances: Variances) -> FloatArray:
         """Return the prior deviation of coefficients outside of a set [E]: as the recording makes them and the discrepancy
@@ -445,14 +449,36 @@ class Equations:
 
     def _without_shared(self, total: FloatArray, variances: Variances) -> tuple[FloatArray, float]:
         """Return the equations over [E, response] without the shared discrepancy, and its log determinant."""
-        many = len(self.shared)
-        w = np.arange(self.E, self.E + many)
-        o = np.concatenate((np.arange(self.E), [self.E + many])).astype(np.intp)
+        w, o = self._places()
         v = self._shared_variances(variances)
         lower = np.linalg.cholesky(total[np.ix_(w, w)] + np.diag(1.0 / v))
         half = np.linalg.solve(lower, total[np.ix_(w, o)])
         log = 2.0 * float(np.sum(np.log(np.diag(lower)))) + float(np.sum(np.log(v)))
         return total[np.ix_(o, o)] - half.T @ half, log
+
+    def _scatter(
+        self, total: FloatArray, keep: Sequence[tuple[FloatArray, FloatArray]], variances: Variances
+    ) -> Scatter:
+        """Return the noise over [E, response] that is left by what a recording has of its own and by the discrepancy: what
+        these explain of a column they explain of its noise.
+        """
+
+        def left(noise: FloatArray, o: Index, n: Index, into: FloatArray) -> FloatArray:
+            side = noise[np.ix_(n, o)].T @ into
+            return np.asarray(noise[np.ix_(o, o)] - side - side.T + into.T @ noise[np.ix_(n, n)] @ into)
+
+        whole = np.zeros_like(total)
+        for noise, (lower, cross) in zip(self.noise, keep, strict=True):
+            whole += left(noise, self._outer, self._inner, cho_solve((lower, True), cross))
+        w, o = self._places()
+        inner = total[np.ix_(w, w)] + np.diag(1.0 / self._shared_variances(variances))
+        into = np.asarray(np.linalg.solve(inner, total[np.ix_(w, o)]), np.float64)
+        return Scatter(left(whole, o, w, into), self.rows)
+
+    def _places(self) -> tuple[Index, Index]:
+        """Return where the shared discrepancy is in the equations over [E, shared, response], and where all else is."""
+        end = self.E + len(self.shared)
+        return np.arange(self.E, end), np.append(np.arange(self.E), end).astype(np.intp)
 
     def expected(
         self, chosen: Set, variances: Variances, steps: int
@@ -482,7 +508,6 @@ class Equations:
             contrast = np.zeros(e + many + 1)
             contrast[q], contrast[-1] = -theta, 1.0
             squares, spread, means = np.zeros(self.N), np.zeros(self.N), []
-            score += self.scatter.by_chance(-contrast[: self.E])
             for factor, cross in keep:
                 inverse = np.linalg.inv(factor)
                 inverse = inverse.T @ inverse
@@ -498,6 +523,7 @@ class Equations:
                     shared = now["shared", g]
                     score += n0 * (math.log(shared) + v0 / shared)
             if step == steps:
+                score += self._scatter(total, keep, now).by_chance(-contrast[:e])
                 break
             now = self._maximised(now, (squares, spread), (theta[len(at) :], np.diag(covariance)[len(at) :]))
         return now, score, Means(theta[: len(at)], theta[len(at) :], means, self.turned)

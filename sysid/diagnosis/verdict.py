@@ -100,8 +100,7 @@ def predict(solution: Solution) -> Prediction:
     contrasts = [np.append(-mean, 1.0) for mean in mixed[:-1]]
     each = list(zip(grams, contrasts, counts, strict=True))
     squares = {
-        c: np.array([(g[c][-1, -1], float(x @ g[c] @ x), count[c]) for g, x, count in each])
-        for c in grams[0]
+        c: np.array([(g[c][-1, -1], float(x @ g[c] @ x), count[c]) for g, x, count in each]) for c in grams[0]
     }
     named = wide if part > 0.0 else chosen
     return Prediction(named, mixed[-1][without[-1].columns(named)], squares)
@@ -193,7 +192,9 @@ def _grams(solution: Solution) -> tuple[list[dict[Channel, FloatArray]], list[di
             if run.name in noisy:
                 noise = _rows(noisy[run.name], c, weights, run) - x
                 extra[pieces[r]][c] += noise.T @ noise
-    clean = [{c: without_noise(g, e[c]) for c, g in of.items()} for of, e in zip(grams, extra, strict=True)]
+    clean = [
+        {c: without_noise(g, e[c])[0] for c, g in of.items()} for of, e in zip(grams, extra, strict=True)
+    ]
     return clean, counts
 
 

@@ -388,7 +388,7 @@ def with_noise(seed: int, columns: int = 6) -> tuple[FloatArray, FloatArray]:
 def test_equations_without_noise_are_those_of_measurements(seed: int) -> None:
     """Whatever is taken out: no square is negative, none explains more than there is, and the response keeps its own."""
     gram, noise = with_noise(seed)
-    clean = without_noise(gram, (1.0 + seed % 3) * noise)  # known to its scatter, or not at all
+    clean, _ = without_noise(gram, (1.0 + seed % 3) * noise)  # known to its scatter, or not at all
     assert np.linalg.eigvalsh(clean)[0] > -1e-9 * np.trace(gram)
     assert np.linalg.eigvalsh((gram - clean)[:-1, :-1])[0] > -1e-9 * np.trace(gram)
     assert clean[-1, -1] == gram[-1, -1]
@@ -398,20 +398,23 @@ def test_it_does_not_matter_which_columns_span_the_equations_without_noise() -> 
     gram, noise = with_noise(3)
     turn = np.eye(7)
     turn[:6, :6] = np.random.default_rng(4).normal(size=(6, 6))
-    turned = without_noise(turn.T @ gram @ turn, turn.T @ noise @ turn)
-    assert turned == pytest.approx(turn.T @ without_noise(gram, noise) @ turn, rel=1e-6, abs=1e-6 * gram.max())
+    for other, one in zip(
+        without_noise(turn.T @ gram @ turn, turn.T @ noise @ turn), without_noise(gram, noise), strict=True
+    ):
+        assert other == pytest.approx(turn.T @ one @ turn, rel=1e-6, abs=1e-6 * gram.max())
 
 
 def test_a_direction_that_is_mostly_noise_is_none() -> None:
     """Two columns that differ by noise alone are one, although neither is noise for the most part."""
     gram = 100.0 * np.array([[1.0, 0.9, 0.5], [0.9, 1.0, 0.4], [0.5, 0.4, 1.0]])
     noise = np.diag([8.0, 8.0, 0.0])  # of their difference 16, of which there is 20
-    clean = without_noise(gram, noise)
+    clean, taken = without_noise(gram, noise)
     one, other = np.array([1.0, -1.0]), np.array([1.0, 1.0])
     assert clean[:2, :2] @ one == pytest.approx(0.0, abs=1e-9)
     assert clean[:2, -1] @ one == pytest.approx(0.0, abs=1e-9)
     assert other @ clean[:2, :2] @ other == pytest.approx(380.0 - 16.0)
     assert clean[:2, -1] @ other == pytest.approx(90.0)
+    assert taken[:2, :2] == pytest.approx(4.0, abs=1e-9)  # of their sum alone
 
 
 @pytest.mark.parametrize(
@@ -451,11 +454,26 @@ def test_a_score_and_an_evidence_lack_the_same_by_chance() -> None:
     equations = equations_of(blocks, [entry()], ("viscous",), noise=noise)
     chosen, variances = frozenset({0}), {"viscous": 1e-6}
     _, sure, means = equations.expected(chosen, variances, 0)
-    equations.scatter = equations.scatter._replace(rows=600.0)
+    equations.rows = 600.0
     _, score, _ = equations.expected(chosen, variances, 0)
-    taken = equations.scatter.by_chance(means.beta)
-    assert abs(taken - equations.scatter.by_chance(-means.beta)) > 0.2 * taken
+    scatter = equations.sets(variances, chosen).noise
+    taken = scatter.by_chance(means.beta)
+    assert abs(taken - scatter.by_chance(-means.beta)) > 0.2 * taken
     assert score - sure == pytest.approx(taken)
+
+
+def test_noise_that_each_recording_explains_by_its_own_is_no_gain_of_a_set() -> None:
+    """A friction and that of the day have one column, and so one noise."""
+    rng = np.random.default_rng(18)
+    columns = [rng.normal(size=400) for _ in range(3)]
+    blocks = [np.column_stack((x, x, -0.5 * x + rng.normal(size=400))) for x in columns]
+    noise = 60.0 * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    equations = equations_of(blocks, [entry()], ("viscous",), noise=noise)
+    equations.rows = 1200.0
+    size = np.array([-0.5])
+    little, wide = (equations.sets({"viscous": v}).noise.by_chance(size) for v in (1e-9, 10.0))
+    assert little == pytest.approx(SURE * math.sqrt(2.0 / 1200.0) * 3.0 * 60.0 * 0.25, rel=1e-3)
+    assert wide < 1e-3 * little
 
 
 def test_noise_that_a_column_brings_into_the_discrepancy_is_taken_out_there_as_well() -> None:
