@@ -22,7 +22,14 @@ from jtqd.estimator.arrays import BoolArray, FloatArray
 def below(x: FloatArray, step_s: float, hz: float) -> FloatArray:
     """Return x [.., n] without what is quicker than hz, without delay."""
     reach = min(x.shape[-1] - 1, max(12, round(1.0 / (hz * step_s))))
-    return np.asarray(signal.sosfiltfilt(_low_pass(min(hz * step_s, 0.45)), x, padlen=reach))
+    sections, state = _low_pass(min(hz * step_s, 0.45))
+    state = state.reshape(len(state), *[1] * (x.ndim - 1), 2)
+    # mirrored about its ends, there and back, as `signal.sosfiltfilt`, which finds the state anew each time
+    ends = 2.0 * x[..., :1] - x[..., reach:0:-1], 2.0 * x[..., -1:] - x[..., -2 : -reach - 2 : -1]
+    out = np.concatenate((ends[0], x, ends[1]), axis=-1)
+    for _ in range(2):
+        out = signal.sosfilt(sections, out, zi=state * out[..., :1])[0][..., ::-1]
+    return np.asarray(out[..., reach:-reach])
 
 
 def mean_ahead(time_s: FloatArray, x: FloatArray, span_s: float) -> FloatArray:
@@ -239,9 +246,10 @@ def cutoff_hz(sigma: FloatArray, step_s: float, most: float, *, of_velocity: boo
 
 
 @functools.lru_cache(maxsize=64)
-def _low_pass(part: float) -> FloatArray:
-    """Return the sections of a Butterworth low-pass; part: of the sampling rate."""
-    return np.asarray(signal.butter(_ORDER, part, fs=1.0, output="sos"))
+def _low_pass(part: float) -> tuple[FloatArray, FloatArray]:
+    """Return the sections of a Butterworth low-pass and their state after ones for ever; part: of the sampling rate."""
+    sections = np.asarray(signal.butter(_ORDER, part, fs=1.0, output="sos"))
+    return sections, np.asarray(signal.sosfilt_zi(sections))
 
 
 @dataclass(frozen=True)
