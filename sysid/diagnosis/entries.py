@@ -266,7 +266,7 @@ def _set_torsion(s: JointSignals, mine: Sequence[Present]) -> None:
     bent = [p for p in loading if "torsion_rad" in p.effect.needs]
     stiffness = s.joint.stiffness_nm_per_rad
     total = s.state.torque_nm + _sum(s, [p for p in loading if p not in bent], TORSION)
-    total = held_by_spring(s.joint, total, s.time_s)
+    total = held_by_spring(s.believed[0], total, s.time_s)
     s.state.torsion_rad = total / stiffness
     if not bent:
         return

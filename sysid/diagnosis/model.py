@@ -360,8 +360,10 @@ class _Work:
         variances: Mapping[object, float],
         changed: frozenset[str] = _STATES,
     ) -> None:
-        """Move to the solution; again with the coefficients there, where the current that effects see depends on the set."""
-        acting = any("current_a" in self._used[k] for k in chosen)
+        """Move to the solution; again with the coefficients there, where current or torsion that effects see depend on the
+        set.
+        """
+        acting = any(self._used[k] & {"current_a", "torsion_rad"} for k in chosen)
         self.move(chosen, mean, changed, chosen if acting else None)
         before: tuple[FloatArray, FloatArray] | None = None
         for step in range(_SETTLING if acting else 0):
