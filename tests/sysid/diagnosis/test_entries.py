@@ -194,9 +194,7 @@ def test_a_wave_that_turns_too_fast_to_be_seen_is_no_entry(plain: Runs) -> None:
     assert np.mean(moving) == pytest.approx(0.05, abs=0.005)
     library = library_candidates(signals, {1: ARM}, EVERYTHING)
     [cogging] = [
-        c
-        for c in library
-        if c.effect.name == "cogging" and c.term.basis[0]["order_per_motor_rev"] == 24.0
+        c for c in library if c.effect.name == "cogging" and c.term.basis[0]["order_per_motor_rev"] == 24.0
     ]
     assert entry_of(cogging, ARM, replace(USE, order=23.0), 1, {}) is None
     assert entry_of(cogging, ARM, replace(USE, order=25.0), 1, {}) is not None

@@ -91,7 +91,9 @@ def test_gains_are_differences_of_evidence(small: tuple[FloatArray, FloatArray, 
             assert gains[k] == pytest.approx(both, abs=1e-9), k
 
 
-def test_a_slot_is_taken_once_and_what_is_banned_stays_out(small: tuple[FloatArray, FloatArray, Sets]) -> None:
+def test_a_slot_is_taken_once_and_what_is_banned_stays_out(
+    small: tuple[FloatArray, FloatArray, Sets],
+) -> None:
     _, _, sets = small
     entries = [entry(size, slot="one" if k in (2, 4) else None) for k, size in enumerate(SIZES)]
     shared = Sets(entries, sets.gram)
