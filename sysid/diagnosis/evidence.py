@@ -154,12 +154,13 @@ class Sets:
     def lacks(self, chosen: Set, other: Set) -> float:
         """Return twice the log evidence that another set lacks, less what noise may by chance have made of it."""
         fits = [self.fit(s) for s in (chosen, other)]
-        apart = self.noise.by_chance(*map(self._spread, (chosen, other), (fit.mean for fit in fits)))
+        apart = self.noise.by_chance(*map(self.coefficients, (chosen, other)))
         return 2.0 * (fits[0].evidence - fits[1].evidence) - apart
 
-    def _spread(self, chosen: Set, mean: FloatArray) -> FloatArray:
+    def coefficients(self, chosen: Set, mean: FloatArray | None = None) -> FloatArray:
+        """Return the coefficients of all entries with this set [E]; mean: those of the set, where they are known."""
         out = np.zeros(len(self.gram) - 1)
-        out[self.columns(chosen)] = mean
+        out[self.columns(chosen)] = self.fit(chosen).mean if mean is None else mean
         return out
 
     def fit(self, chosen: Set) -> Fit:
@@ -176,7 +177,7 @@ class Sets:
         mean = _within(inner, right, *_bounds(self.entries, chosen))
         covariance = cho_solve(factor, np.eye(len(at)))
         explained = float(2.0 * mean @ right - mean @ inner @ mean)
-        explained -= self.noise.by_chance(self._spread(chosen, mean))
+        explained -= self.noise.by_chance(self.coefficients(chosen, mean))
         evidence = 0.5 * explained - float(np.sum(np.log(np.diag(factor[0]))))
         return Fit(mean, covariance, evidence + sum(self.entries[k].odds for k in chosen))
 
@@ -412,21 +413,13 @@ class Equations:
         return [self._without_shared(total, variances)[0] for total in totals]
 
     def _without_resemblance(self, gram: FloatArray, variances: Variances) -> FloatArray:
-        """Return the equations over [E, response] without what of the discrepancy resembles the entries; of directions in
-        which noise has more energy than there is, nothing is kept.
+        """Return the equations over [E, response] without what of the discrepancy resembles the entries: its covariance
+        beside the noise's, by the matrix inversion lemma.
         """
         deviation = self.deviation(variances)
-        values, vectors = np.linalg.eigh(gram[: self.E, : self.E])
-        known = vectors[:, values > 0.0]
-        root = np.sqrt(values[values > 0.0])
-        factor = known * root
-        projected = (known.T @ gram[: self.E, -1]) / root
-        inner = np.linalg.inv(np.eye(len(root)) + factor.T @ (deviation[:, None] ** 2 * factor))
-        out = np.empty_like(gram)
-        out[: self.E, : self.E] = factor @ inner @ factor.T
-        out[: self.E, -1] = out[-1, : self.E] = factor @ (inner @ projected)
-        out[-1, -1] = gram[-1, -1] - projected @ (projected - inner @ projected)
-        return out
+        part = deviation[:, None] * gram[: self.E]
+        inner = np.eye(self.E) + part[:, : self.E] * deviation
+        return np.asarray(gram - part.T @ np.linalg.solve(inner, part))
 
     def _reduced(
         self, variances: Variances

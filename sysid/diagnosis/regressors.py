@@ -79,7 +79,8 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
 
     hooks = effect.hooks
     if "loss_nm" in hooks:
-        share = s.visible_share_of(p.get("order_per_motor_rev", 0.0))
+        turns = p.get("order_per_motor_rev", 0.0) * joint.gear_ratio
+        share = s.visible_share(turns * s.state.velocity_rad_s) if turns else 1.0
         add(MOTOR, effect.loss_nm(p, state, own, x) * share)
     if "current_a" in hooks:
         add(MOTOR, s.nm_per_a * effect.current_a(p, state, own, x))

@@ -254,18 +254,6 @@ class JointSignals:
         turns = np.abs(self.joint.gear_ratio * self.state.velocity_rad_s) / (2.0 * math.pi)
         return np.asarray(hz / np.maximum(turns, 1e-12))
 
-    def visible_share_of(self, order_per_motor_rev: float) -> FloatArray:
-        """Return `visible_share` [n] of a wave of this order; that of the last order is kept."""
-        if order_per_motor_rev not in self._shares:
-            self._shares.clear()
-            rate = order_per_motor_rev * self.joint.gear_ratio * self.state.velocity_rad_s
-            self._shares[order_per_motor_rev] = self.visible_share(rate)
-        return self._shares[order_per_motor_rev]
-
-    @cached_property
-    def _shares(self) -> dict[float, FloatArray]:
-        return {}
-
     def visible_share(self, rate_rad_s: FloatArray) -> FloatArray:
         """Return how much of a torque that swings at this rate [n] the motor balance holds [n].
 

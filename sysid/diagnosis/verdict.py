@@ -96,7 +96,7 @@ def predict(solution: Solution) -> Prediction:
     values = {k for k, e in enumerate(solution.entries) if e.prior.file and e.slot not in slots}
     wide = chosen | values
     part = stacked(grams, without, chosen, wide) if len(grams) > 1 else 0.0
-    mixed = [_coefficients(sets, chosen) + part * _added(sets, chosen, wide) for sets in without]
+    mixed = [sets.coefficients(chosen) + part * _added(sets, chosen, wide) for sets in without]
     contrasts = [np.append(-mean, 1.0) for mean in mixed[:-1]]
     each = list(zip(grams, contrasts, counts, strict=True))
     squares = {
@@ -114,25 +114,18 @@ def stacked(
     """
     slope = curvature = 0.0
     for run, sets in zip(grams, without[:-1], strict=True):
-        few, step = _coefficients(sets, chosen), _added(sets, chosen, wide)
+        few, step = sets.coefficients(chosen), _added(sets, chosen, wide)
         for gram in run.values():
             slope += float(step @ (gram[:-1, -1] - gram[:-1, :-1] @ few))
             curvature += float(step @ gram[:-1, :-1] @ step)
     return min(max(slope / curvature, 0.0), 1.0) if curvature > 0.0 else 0.0
 
 
-def _coefficients(sets: Sets, chosen: Set) -> FloatArray:
-    """Return the coefficients of all entries with this set [E]."""
-    out = np.zeros(len(sets.gram) - 1)
-    out[sets.columns(chosen)] = sets.fit(chosen).mean
-    return out
-
-
 def _added(sets: Sets, chosen: Set, wide: Set) -> FloatArray:
     """Return what a wide set adds to a set whose entries keep their sizes [E]: those are where simulations settled."""
     left = np.eye(len(sets.gram))
-    left[:-1, -1] = -_coefficients(sets, chosen)
-    return _coefficients(Sets(sets.entries, left.T @ sets.gram @ left), wide - chosen)
+    left[:-1, -1] = -sets.coefficients(chosen)
+    return Sets(sets.entries, left.T @ sets.gram @ left).coefficients(wide - chosen)
 
 
 def fits_without(solution: Solution) -> list[Sets]:

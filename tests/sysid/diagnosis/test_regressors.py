@@ -68,13 +68,6 @@ def test_columns_are_the_hooks_in_the_balances_of_the_contract(name: str) -> Non
                 assert there == pytest.approx(np.broadcast_to(expected, there.shape), abs=1e-9)
 
 
-def test_the_visible_share_that_is_kept_is_of_the_order_asked_for() -> None:
-    s = made_up(BARE)
-    for order in (0.0, 2.0, 2.0, 3.0, 0.0):
-        rate = order * BARE.gear_ratio * s.state.velocity_rad_s
-        assert np.array_equal(s.visible_share_of(order), s.visible_share(rate))
-
-
 def test_the_damper_feels_an_error_of_the_teeth_and_the_link_its_acceleration() -> None:
     """A kinematic error at constant speed: sines whose derivatives are known."""
     joint = replace(PLAIN, link_inertia_kgm2=0.5)
