@@ -38,7 +38,6 @@ from jtqd.sysid.diagnosis.regressors import (
     bin_samples,
     contribution,
     families,
-    gain_columns,
     run_data,
     samples_in,
     saturated_residuals,
@@ -140,8 +139,7 @@ class Dataset:
     @cached_property
     def unexplained(self) -> dict[Channel, list[FloatArray]]:
         """What none of the candidates explains, per channel and run [n]."""
-        leave = gain_columns(self.candidates)
-        return {c: saturated_residuals(self.runs, c, leave) for c in self.runs[0].channels}
+        return {c: saturated_residuals(self.runs, c, self.candidates) for c in self.runs[0].channels}
 
     def of(self, channel: Channel) -> list[ChannelData]:
         """Return a channel of every run."""

@@ -244,15 +244,13 @@ def set_state(s: JointSignals, present: Sequence[Present]) -> None:
     rest = s.demand_nm + _sum(s, [p for p in mine if p not in acting], MOTOR)
     s.state.current_a = rest / s.nm_per_a
     most = _MOST_CURRENT * float(np.max(np.abs(rest), initial=0.0)) / s.nm_per_a
+    # secants: what is drawn falls or rises with the current of its own moment
     before, lack = s.state.current_a, np.zeros(len(s.time_s))
-    for _ in range(
-        _DRAWS if acting else 0
-    ):  # secants: what is drawn falls or rises with the current of its own moment
+    for _ in range(_DRAWS if acting else 0):
         last, lack = lack, (rest + _sum(s, acting, MOTOR)) / s.nm_per_a - s.state.current_a
         moved = s.state.current_a - before
-        slope = np.divide(
-            lack - last, moved, out=np.full(len(moved), -1.0), where=np.abs(moved) > _NO_STEP * most
-        )
+        there = np.abs(moved) > _NO_STEP * most
+        slope = np.divide(lack - last, moved, out=-np.ones(len(moved)), where=there)
         before = s.state.current_a
         s.state.current_a = np.clip(before - lack / np.clip(slope, *_SLOPES), -most, most)
         if float(np.max(np.abs(lack))) < _NO_STEP * most:

@@ -75,14 +75,12 @@ def slices_of(entries: Iterable[Entry]) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(ends)]
 
 
-def _bounds(entries: Sequence[Entry], chosen: Set) -> tuple[FloatArray, FloatArray]:
-    """Return the least and the largest value of each coefficient of a set."""
-    ends = [
-        (e.low, e.high) if e.candidate.size == 1 and k == 0 else (-math.inf, math.inf)
-        for e in (entries[j] for j in sorted(chosen))
-        for k in range(e.size)
-    ]
-    return np.array([a for a, _ in ends]), np.array([b for _, b in ends])
+def _bounds(entries: Iterable[Entry]) -> tuple[FloatArray, FloatArray]:
+    """Return the least and the largest value of each coefficient of all entries [E]: of a term's own, not of its shapes."""
+    own = [e.candidate.size == 1 and k == 0 and e for e in entries for k in range(e.size)]
+    return np.array([e.low if e else -math.inf for e in own]), np.array(
+        [e.high if e else math.inf for e in own]
+    )
 
 
 def _within(inner: FloatArray, right: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
@@ -141,9 +139,7 @@ class Sets:
             for size in sorted({e.size for e in entries} - {1})
             for members in [np.flatnonzero([e.size == size for e in entries])]
         ]
-        singles = [e for e in entries if e.size == 1]
-        self._low = np.array([e.low for e in singles])
-        self._high = np.array([e.high for e in singles])
+        self._low, self._high = _bounds(entries)
         self._odds = np.array([e.odds for e in entries])
         self._fits: dict[Set, Fit] = {}
 
@@ -174,7 +170,7 @@ class Sets:
         inner = self.gram[np.ix_(at, at)] + np.eye(len(at))
         right = self.gram[at, -1]
         factor = cho_factor(inner)
-        mean = _within(inner, right, *_bounds(self.entries, chosen))
+        mean = _within(inner, right, self._low[at], self._high[at])
         covariance = cho_solve(factor, np.eye(len(at)))
         explained = float(2.0 * mean @ right - mean @ inner @ mean)
         explained -= self.noise.by_chance(self.coefficients(chosen, mean))
@@ -201,7 +197,7 @@ class Sets:
             precision = rest[self._place, self._place] + 1.0
             b = response[self._place]
             with np.errstate(divide="ignore", invalid="ignore"):
-                best = np.clip(b / precision, self._low, self._high)
+                best = np.clip(b / precision, self._low[self._place], self._high[self._place])
                 value = best * b - 0.5 * precision * best**2 - 0.5 * np.log(precision)
             good = (precision >= 1.0) & free[self._single]
             out[self._single[good]] = value[good]
@@ -317,14 +313,10 @@ def without_noise(gram: FloatArray, noise: FloatArray) -> tuple[FloatArray, Floa
     response = white.T @ (gram[:-1, -1] - noise[:-1, -1])
     most = float(np.sum(response**2 / (1.0 - part)))  # no direction explains more than there is
     response *= min(1.0, math.sqrt(gram[-1, -1] / most)) if most > 0.0 else 1.0
-    clean, taken = np.empty_like(gram), np.empty_like(gram)
-    for each, square, last in (
-        (clean, 1.0 - part, response),
-        (taken, part, white.T @ noise[:-1, -1]),
-    ):
+    clean, taken = gram.copy(), noise.copy()
+    for each, square, last in ((clean, 1.0 - part, response), (taken, part, white.T @ noise[:-1, -1])):
         each[:-1, :-1] = back * square @ back.T
         each[:-1, -1] = each[-1, :-1] = back @ last
-    clean[-1, -1], taken[-1, -1] = gram[-1, -1], noise[-1, -1]
     return clean, taken
 
 
@@ -344,11 +336,10 @@ class Equations:
         shared: Index,
         start: Mapping[object, tuple[float, float]],
         most: Mapping[object, float],
-        recorded: FloatArray | None = None,
         rows: float = math.inf,
     ) -> None:
         self.entries, self.groups, self.shared = list(entries), groups, shared
-        self.recorded = np.zeros(sum(e.size for e in entries)) if recorded is None else recorded
+        self.recorded = np.zeros(sum(e.size for e in entries))
         self.plain, self.start, self.most = grams.sum(axis=0), start, most
         parts = [without_noise(*each) for each in zip(grams, noise, strict=True)]
         self.grams, self.noise = (np.array(x) for x in zip(*parts, strict=True))
@@ -484,8 +475,8 @@ class Equations:
     ) -> tuple[dict[object, float], float, Means]:
         at, many, e = columns_of(self.entries, chosen), len(self.shared), self.E
         now = dict(variances)
-        ends = zip(_bounds(self.entries, chosen), (-math.inf, math.inf), strict=True)
-        low, high = (np.append(x, np.full(many, none)) for x, none in ends)
+        ends = zip(_bounds(self.entries), (-math.inf, math.inf), strict=True)
+        low, high = (np.append(x[at], np.full(many, none)) for x, none in ends)
         for step in range(steps + 1):
             parts, logs, keep = self._reduced(now)
             total = np.sum(parts, axis=0)

@@ -37,7 +37,6 @@ from jtqd.sysid.diagnosis.regressors import (
     EffectCandidate,
     RunData,
     binned,
-    gain_columns,
     noise_of_channels,
     run_sums,
     saturated_residuals,
@@ -98,8 +97,7 @@ def compared(dataset: Dataset, kinds: Sequence[Deviation]) -> Comparison:
     pieces, families = np.array(dataset.recordings, np.intp), len(dataset.families)
     both = list(zip(dataset.runs, dataset.signals, strict=True))
     runs = [_with_columns(run, signals, kinds, families) for run, signals in both]
-    leave = gain_columns(dataset.candidates)
-    residuals = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
+    residuals = {c: saturated_residuals(runs, c, dataset.candidates) for c in runs[0].channels}
     noise = noise_of_channels(residuals, dataset.step_s)
     columns = dataset.candidates[-1].columns.stop if dataset.candidates else 0
     sums = [run_sums(run, noise, columns, families + len(kinds)) for run in runs]

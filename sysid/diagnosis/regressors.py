@@ -7,7 +7,7 @@ torsion balance or both of that joint; an effect of the sensor in all channels a
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -392,11 +392,6 @@ def _axes(s: JointSignals, samples: float) -> dict[str, FloatArray]:
     return {axis: binned(getattr(s.state, name), samples) for axis, name in _AXES.items()} | of_load
 
 
-def gain_columns(candidates: Sequence[EffectCandidate]) -> set[int]:
-    """Return the columns of the torque sensor's gain (see `saturated_residuals`)."""
-    return {k for c in candidates if c.effect.scales_all for k in c.columns}
-
-
 _CONDITIONS: Final = ("velocity", "load", "link_angle")
 _RATES: Final = ("load_rate", "load_second_rate")
 _POINTS: Final = 200
@@ -524,15 +519,16 @@ def run_sums(run: RunData, noise: Noise, columns: int, nuisances: int) -> Sums:
 
 
 def saturated_residuals(
-    runs: Sequence[RunData], channel: Channel, leave: Collection[int] = ()
+    runs: Sequence[RunData], channel: Channel, candidates: Iterable[EffectCandidate] = ()
 ) -> list[FloatArray]:
     """Return what no effect and no change from run to run explains, per run [n], NaN where not valid.
 
-    leave: columns not to use. The residual is a sum of measured terms (current, friction, acceleration, sensor); with a
-    regressor for each of them it would be explained completely by taking all of them away.
+    The residual is a sum of measured terms (current, friction, acceleration, sensor); with a regressor for each of them it
+    would be explained completely by taking all of them away. So a gain of the sensor, of these candidates, is none.
     """
+    leave = [k for c in candidates if c.effect.scales_all for k in c.columns]
     data = [run.channels[channel] for run in runs if channel in run.channels]
-    keep = np.flatnonzero(~np.isin(data[0].index, list(leave)))
+    keep = np.flatnonzero(~np.isin(data[0].index, leave))
     q = data[0].nuisances.shape[1]
     p = len(keep)
     total = p + q * len(data)

@@ -117,10 +117,6 @@ class Unexplained:
         most = {c: np.max(np.sum([v.by_run for v in found], axis=0)) for c, found in self.views.items()}
         return {c: max(float(nm2), 0.0) ** 0.5 for c, nm2 in most.items()}
 
-    def energy_nm2(self) -> float:
-        """Return the energy that is structure, summed over channels [Nm^2]."""
-        return sum(self.by_channel().values())
-
     def by_channel(self) -> dict[Channel, float]:
         """Return the energy that is structure, per channel [Nm^2]."""
         return {c: sum(v.energy_nm2 for v in found) for c, found in self.views.items()}

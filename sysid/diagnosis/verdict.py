@@ -351,8 +351,9 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
     left = remaining(dataset, *present_of(solution))
     rest = unexplained_residual(left)
     predicting = effects_of(solution, prediction.chosen, prediction.mean)
-    total_nm2 = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + rest.energy_nm2()
-    left_share = rest.energy_nm2() / max(total_nm2, 1e-30)
+    left_nm2 = sum(rest.by_channel().values())
+    total_nm2 = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + left_nm2
+    left_share = left_nm2 / max(total_nm2, 1e-30)
     unexplained = _unexplained(rest, held_nm(left), limits_nm, dataset, left_share)
     found = sorted(
         (_cause(solution, j, total_nm2, rest, limits_nm) for j in effects), key=lambda x: -x[0].rms_nm

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
@@ -120,7 +123,8 @@ def test_what_nothing_explains_is_the_residual_of_least_squares() -> None:
             target.append(d.residual[d.valid])
         x, y = np.vstack(rows), np.concatenate(target)
         direct = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
-        found = saturated_residuals(runs, MOTOR1, leave)
+        gain = SimpleNamespace(effect=SimpleNamespace(scales_all=True), columns=leave)
+        found = saturated_residuals(runs, MOTOR1, [cast("Any", gain)])
         for run, part in zip(runs, found, strict=True):
             assert np.isnan(part).tolist() == (~run.channels[MOTOR1].valid).tolist()
         everything = np.concatenate(found)
