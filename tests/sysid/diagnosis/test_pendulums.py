@@ -144,7 +144,7 @@ RIGS = (
 
 @pytest.fixture(
     scope="module",
-    params=[0, pytest.param(1, marks=pytest.mark.campaign), 2],
+    params=[0, *(pytest.param(seed, marks=pytest.mark.campaign) for seed in (1, 2))],
     ids=[f"{r.rate_hz:.0f} Hz" for r in RIGS],
 )
 def wrong_file(request: pytest.FixtureRequest) -> Case:
@@ -203,7 +203,9 @@ def strange_friction(v: FloatArray, tau: FloatArray, theta: FloatArray) -> Float
 
 
 @pytest.fixture(
-    scope="module", params=[3, pytest.param(4, marks=pytest.mark.campaign), 6], ids=lambda n: f"{n} runs"
+    scope="module",
+    params=[3, *(pytest.param(n, marks=pytest.mark.campaign) for n in (4, 6))],
+    ids=lambda n: f"{n} runs",
 )
 def one_more(request: pytest.FixtureRequest) -> Case:
     rig = Rig(days=0.05)
@@ -556,7 +558,10 @@ def test_what_a_quick_load_shows_of_motor_and_spring_has_its_own_name(
     assert value.ci95[0] < getattr(SPRUNG, key) < value.ci95[1]
 
 
-@pytest.mark.parametrize(("counts", "viscous", "rate_hz"), [(2.0**8, 20.0, 250.0), (2.0**10, 40.0, 125.0)])
+@pytest.mark.parametrize(
+    ("counts", "viscous", "rate_hz"),
+    [(2.0**8, 20.0, 250.0), pytest.param(2.0**10, 40.0, 125.0, marks=pytest.mark.campaign)],
+)
 def test_a_friction_that_is_wrong_in_every_run_is_no_friction_of_the_day(
     counts: float, viscous: float, rate_hz: float
 ) -> None:
