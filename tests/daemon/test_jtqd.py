@@ -179,18 +179,6 @@ def test_method_fused_on_the_emulated_bench(tmp_path: Path, environment: dict[st
         assert not np.isfinite(state["tob_nm"]).any(), "no stage of this method"
 
 
-def test_a_network_of_another_method_is_refused_in_one_line(
-    tmp_path: Path, environment: dict[str, str]
-) -> None:
-    config = str(configured(tmp_path, "network", networks()))
-    result = run("--bus", "sim", "--config", config, "--record", "none", environment=environment)
-    assert result.returncode == 2, "a file is wrong: systemd does not start it again"
-    (line,) = (text for text in no_traceback(result).splitlines() if not text.startswith("bench ready"))
-    assert line.startswith(
-        f"jtqd: {tmp_path}/n1.onnx: found input 'x' of shape ['N', 28], expected ['N', 6] ("
-    )
-
-
 @contextmanager
 def a_bench(directory: Path) -> Iterator[str]:
     """The emulated bench as a process; the address of its bus."""
@@ -358,16 +346,6 @@ def test_unknown_bus(environment: dict[str, str]) -> None:
     assert list(Path(environment["RUNTIME_DIRECTORY"]).iterdir()) == [], "nothing is left behind"
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [[], ["--bus"], ["--bus", 300 * "a"], ["--bus", "sim", "--duration", "-1"], ["--bus", "sim", "--frob"]],
-)
-def test_usage(arguments: list[str], environment: dict[str, str]) -> None:
-    result = run(*arguments, environment=environment)
-    assert result.returncode == 2
-    no_traceback(result)
-
-
 def configuration(directory: Path, **changes: object) -> str:
     content = shipped_bench()
     for key, value in changes.items():
@@ -381,36 +359,6 @@ def configuration(directory: Path, **changes: object) -> str:
     return str(path)
 
 
-def refused(bus: str, config: str, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    options = ["--bus", bus, "--config", config, "--duration", "1", "--record", "none"]
-    return run(*options, environment=environment)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"joint_2__node": 9}, ["node 9", "1000h"]),
-        ({"joint_1__identity": {"product": 0x1234}}, ["node 1", "1018h:2", "1234"]),
-        ({"sensor__node": 2, "joint_2__node": 3}, ["node", "1000h"]),
-        ({"estimator__method": "nonsense"}, ["estimator.method", "nonsense"]),
-        ({"bitrate": 500_000}, ["bus load", "95"]),
-    ],
-)
-def test_what_does_not_fit_is_named_and_nothing_is_published(
-    tmp_path: Path, environment: dict[str, str], bench: str, changes: dict[str, object], words: list[str]
-) -> None:
-    socket = open_frame_socket(bench, [exact(0x1A0)])
-    path = configuration(tmp_path, **changes)
-    result = refused(bench, path, environment)
-    assert result.returncode == (2 if words[0] in ("estimator.method", "bus load") else 1)
-    lines = no_traceback(result).splitlines()
-    assert len(lines) == 1, lines
-    for word in words:
-        assert word in lines[0]
-    assert socket.receive() == 0
-    socket.close()
-
-
 def with_joint_1(directory: Path, joint_1: dict[str, object], **estimator: object) -> str:
     """A configuration whose first joint file and estimator say something else."""
     joint = yaml.safe_load(shipped("joint1.yaml").read_text())
@@ -418,13 +366,6 @@ def with_joint_1(directory: Path, joint_1: dict[str, object], **estimator: objec
     changes = {f"estimator__{key}": value for key, value in estimator.items()}
     changes["estimator__shadow"] = ["network"]  # of the shipped ones that is no method of these tests
     return configuration(directory, joint_1__file=str(directory / "other.yaml"), **changes)
-
-
-def test_a_wrong_gear_ratio_is_refused(tmp_path: Path, environment: dict[str, str], bench: str) -> None:
-    path = with_joint_1(tmp_path, {"gear_ratio": 120}, method="efficiency")
-    result = refused(bench, path, environment)
-    assert result.returncode == 1
-    assert "6091h gear ratio: expected 120" in no_traceback(result)
 
 
 @pytest.mark.measures
