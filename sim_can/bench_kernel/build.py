@@ -165,6 +165,23 @@ EDITS = (
         "DEFINE_LONGS(HOST_FP_SIZE, 2696);",
         "DEFINE_LONGS(HOST_FP_SIZE, 12288);",
     ),
+    # A page fault takes the host four switches of processes, and a start of Python some thousands of faults. With one come
+    # the pages around it that are in memory, as on any machine, here at once for the host as well; and with a first write
+    # to a private page those that follow.
+    Edit(
+        "arch/um/kernel/trap.c",
+        "\tflush_tlb_page(vma, address);\n",
+        "\n\tif (is_write && !(vma->vm_flags & VM_SHARED))\n"
+        "\t\tfor (unsigned long near = (address & PAGE_MASK) + PAGE_SIZE;\n"
+        "\t\t     near < min(vma->vm_end, (address | 0xffffUL) + 1); near += PAGE_SIZE)\n"
+        "\t\t\tif (pte_none(*pte_offset_kernel(pmd, near)) &&\n"
+        "\t\t\t    handle_mm_fault(vma, near, FAULT_FLAG_WRITE | (flags & FAULT_FLAG_USER), NULL)"
+        " & VM_FAULT_ERROR)\n"
+        "\t\t\t\tbreak;\n"
+        "\tflush_tlb_range(vma, max(vma->vm_start, address & ~0x3ffffUL),"
+        " min(vma->vm_end, (address | 0x3ffffUL) + 1));\n",
+    ),
+    Edit("mm/memory.c", "rounddown_pow_of_two(65536);", "rounddown_pow_of_two(262144);"),
 )
 
 
