@@ -23,7 +23,7 @@ from tests.paths import ROOT
 ARM = ROOT / "examples" / "arm"
 BUSES = {"vcan0": "can0", "vcan1": "can1", "vcan2": "can2", "vcan3": "can3"}
 JOINTS = {"can0": 2, "can1": 2, "can2": 2, "can3": 1, "four_joints": 4}
-DURATION_S = 4.0
+DURATION_S = 2.0
 _LOOK_S = 0.01
 """Between two looks at the estimates; a receive takes up to 32 frames."""
 

@@ -119,7 +119,7 @@ def until(condition, seconds, what):
     while time.monotonic() - began < seconds:
         if condition():
             return time.monotonic() - began
-        time.sleep(0.1)  # each look takes processes
+        time.sleep(0.3)  # each look takes processes
     raise AssertionError(f"not within {seconds} s: {what}")
 
 

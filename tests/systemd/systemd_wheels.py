@@ -25,14 +25,21 @@ def make_wheels(directory: Path) -> Path:
     return _own_wheel(directory)
 
 
-def make_environment(wheels: Path, own: Path, directory: Path) -> Path:
-    """A virtual environment that will lie at /opt/jtqd, made at `directory`."""
+def make_environment(own: Path, directory: Path) -> Path:
+    """A virtual environment that will lie at /opt/jtqd, made at `directory`: this project's wheel, and beside it what is
+    installed here of all that it needs, which is compiled to byte code already.
+    """
     subprocess.run(["/usr/bin/python3", "-m", "venv", "--without-pip", str(directory)], check=True)
     site = next((directory / "lib").glob("python3*")) / "site-packages"
+    for name, distribution in runtime_distributions().items():
+        if name != "jtqd":
+            for top in {file.parts[0] for file in distribution.files or ()} - {"..", "__pycache__"}:
+                here = Path(str(distribution.locate_file(top)))
+                (shutil.copytree if here.is_dir() else shutil.copy2)(here, site / top)
     subprocess.run(
         [
-            *(sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index"),
-            *("--find-links", str(wheels), "--target", str(site), str(own)),
+            *(sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"),
+            *("--target", str(site), str(own)),
         ],
         check=True,
     )

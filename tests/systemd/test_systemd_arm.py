@@ -19,7 +19,7 @@ def test_four_instances_have_one_status_each_and_share_no_fate(tmp_path: Path) -
     if reason is not None:
         pytest.skip(f"systemd not tested: {reason}")
     wheels = tmp_path / "wheels"
-    environment = make_environment(wheels, make_wheels(wheels), tmp_path / "opt")
+    environment = make_environment(make_wheels(wheels), tmp_path / "opt")
     command = [str(PYTHON), str(DRIVER), str(ROOT), str(environment)]
     with guest.Guest(command, systemd=True, time_travel=True, vcans=list(JOINTS)) as one:
         result = one.wait(600.0)

@@ -51,7 +51,7 @@ def booted(directory: Path, steps: tuple[str, ...], *, whole: bool) -> dict[str,
         pytest.skip(f"systemd not tested: {reason}")
     wheels = directory / "wheels"
     own = make_wheels(wheels)
-    prepared = () if whole else ("prepared", str(make_environment(wheels, own, directory / "opt")))
+    prepared = () if whole else ("prepared", str(make_environment(own, directory / "opt")))
     arguments = prepared or (str(own), str(wheels))
     command = [str(PYTHON), str(DRIVER), str(ROOT), *arguments, *steps]
     with guest.Guest(command, systemd=True, time_travel=True, vcans=["vcan0"]) as one:
