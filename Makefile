@@ -35,7 +35,7 @@ test: style ## everything but the tests marked campaign
 BEHIND := nice -n 10
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 # What takes the processor for about as long as the rest of sysid, and as all else.
-HIDDEN := tests/validation tests/examples tests/sysid/batch
+HIDDEN := tests/validation tests/examples tests/sysid/batch tests/sysid/evaluate tests/sysid/fit tests/sysid/train
 HERE := not (campaign or socketcan or boots or native)
 SLOWEST := --durations=20 --durations-min=2
 # $(call MARKED,MARK|MARK): the files with a test so marked; a lane reads no others.
