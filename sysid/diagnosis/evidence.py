@@ -145,7 +145,7 @@ class Sets:
 
     def columns(self, chosen: Set) -> Index:
         """Return the places of a set's coefficients, in order of its entries."""
-        return columns_of(self.entries, chosen)
+        return np.concatenate([np.empty(0, np.intp), *(self.slices[k] for k in sorted(chosen))])
 
     def lacks(self, chosen: Set, other: Set) -> float:
         """Return twice the log evidence that another set lacks, less what noise may by chance have made of it."""
@@ -498,7 +498,7 @@ class Equations:
                 u = inverse @ (cross @ contrast)
                 b = inverse @ cross[:, q]
                 squares += u**2
-                spread += np.diag(inverse) + np.einsum("ij,jk,ik->i", b, covariance, b)
+                spread += np.diag(inverse) + np.sum(b @ covariance * b, axis=1)
                 means.append(u)
             for g in self.kinds:
                 v0, n0 = self.start[g]
