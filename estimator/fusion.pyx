@@ -125,8 +125,7 @@ cdef double HOLD = HOLD_S, DISAGREE = DISAGREE_SIGMAS, FOREIGN = FOREIGN_SIGMAS,
 cdef double BOUNDING = 3.0, PER_BOUND = 1.0 / BOUNDING**2  # standard deviations of a bound
 cdef double PROVING_S = 0.1  # in which paths that agree prove the torsion
 cdef double RESTING_SHARE = 0.025  # of the rated torque, by which the torsion changes at rest from noise
-cdef double DAYS = 2.0  # spreads of the link's offset over the days
-cdef double DOUBTED = 1.5**2  # half of what is learned beyond them is a standard deviation: another sensor may be off
+cdef double DAYS = 2.0, DOUBTED = 1.5**2  # spreads of the link's offset; beyond, half of it is sigma: another sensor may be off
 cdef double AHEAD = 0.05  # part of what the torsion is ahead by
 cdef double LEAST_VARIANCE = 0.05  # part of the torsion's variance that remains, however well its offset is known
 
@@ -277,9 +276,8 @@ cdef double unproven_nm2(const ProofLaw *law, double unproven, double alpha, dou
 
     unproven: as `prove`; link_rad: correction of the link encoder; ahead_nm: change of the torsion unseen by the current path.
     """
-    cdef double learned = law.stiffness * link_rad, ahead = AHEAD * ahead_nm
-    cdef double beyond = DOUBTED * fmax(learned * learned - law.day, 0.0)
-    return alpha * alpha * (unproven * unproven + beyond) * PER_BOUND + ahead * ahead
+    cdef double ahead = AHEAD * ahead_nm, beyond = fmax((law.stiffness * link_rad) ** 2 - law.day, 0.0)
+    return alpha * alpha * (unproven * unproven + DOUBTED * beyond) * PER_BOUND + ahead * ahead
 
 
 class FusedPaths(NamedTuple):
