@@ -24,7 +24,7 @@ def below(x: FloatArray, step_s: float, hz: float) -> FloatArray:
     reach = min(x.shape[-1] - 1, max(12, round(1.0 / (hz * step_s))))
     sections, state = _low_pass(min(hz * step_s, 0.45))
     state = state.reshape(len(state), *[1] * (x.ndim - 1), 2)
-    # mirrored about its ends, there and back, as `signal.sosfiltfilt`, which finds the state anew each time
+    # odd extension at both ends, forward and backward: `signal.sosfiltfilt` with the initial state of its steps kept
     ends = 2.0 * x[..., :1] - x[..., reach:0:-1], 2.0 * x[..., -1:] - x[..., -2 : -reach - 2 : -1]
     out = np.concatenate((ends[0], x, ends[1]), axis=-1)
     for _ in range(2):
