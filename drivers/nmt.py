@@ -32,6 +32,8 @@ COMMANDS: Final = {
     RESET_NODE: "reset node",
     RESET_COMMUNICATION: "reset communication",
 }
+STATE_AFTER: Final = {START: OPERATIONAL, STOP: STOPPED, ENTER_PRE_OPERATIONAL: PRE_OPERATIONAL}
+"""Of a node that obeys; after a reset it sends its boot-up message and is pre-operational."""
 
 
 def command(number: int, node: int) -> bytes:

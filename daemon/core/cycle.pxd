@@ -6,7 +6,7 @@ from libc.stdint cimport int64_t, uint8_t, uint16_t, uint32_t, uint64_t
 from jtqd.daemon.core.intake cimport MOST_INPUTS, Intake
 from jtqd.daemon.core.joint cimport ContactWatch, JointCycle, JointState
 from jtqd.daemon.core.record cimport MOST_JOINTS, RecordRing
-from jtqd.daemon.core.schedule cimport Clock, Grid, NetworkBudget, WakeUp
+from jtqd.daemon.core.schedule cimport Clock, Grid, NetworkBudget, SyncGrid, WakeUp
 from jtqd.drivers.frame_socket cimport Frame, FrameSocket
 from jtqd.estimator.fusion cimport Learned
 
@@ -102,6 +102,20 @@ cdef class Cycle:
     cdef uint32_t next_flags
     cdef int64_t heartbeat_due, sync_realtime_ns, realtime_offset_ns
     cdef uint64_t counted[4]  # stale inputs, late, duplicate and rejected frames when the cycle began
+    cdef SyncGrid seen  # the grid, where SYNC is another node's
+    cdef bint follows, sends, slot_begun, opened, next_sync, quiet
+    cdef int node_id, batch, next_frame, first  # frames of the last `receive`, the next of them, and the first to be taken
+    cdef int64_t first_index, slot_index  # of the first SYNC seen, and of the last one
+    cdef int open_record(self) except -1
+    cdef int64_t read_clocks(self) except? -1
+    cdef int beat(self) except -1
+    cdef int follow(self, int64_t end_ns) except -1
+    cdef int take_until_sync(self) except -1
+    cdef int begin_with(self, const Frame *sync, int64_t stamp_ns) except -1
+    cdef int go_without(self, int64_t now_ns) except -1
+    cpdef int reset_communication(self) except -1
+    cdef int obey(self, int number, int node) except -1
+    cdef int enter(self, uint8_t state) except -1
     cpdef int begin(self) except -1
     cpdef int gather(self) except -1
     cpdef int observe(self) except -1

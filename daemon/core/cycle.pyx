@@ -1,6 +1,6 @@
 """One cycle of the loop, stage by stage. The stages are methods of `Cycle`, so that a benchmark can time each of them.
 
-    begin    count late frames, send SYNC
+    begin    count late frames, send SYNC; as a guest, wait for the SYNC of another node
     gather   one wake-up for all inputs, then wait for missing ones until the deadline
     observe  scale, estimate, decide the status of every joint
     publish  send the estimate PDO, or two of them with more than two joints, and every n-th cycle the heartbeat
@@ -20,7 +20,7 @@ from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
 from jtqd.daemon.core.intake cimport MOST_INPUTS, NODES, NOT_HEARD, Input, Intake
 from jtqd.daemon.core.joint cimport ContactWatch, JointCycle, JointState
 from jtqd.daemon.core.record cimport Header, JointBlock, RecordRing, ShadowBlock
-from jtqd.daemon.core.schedule cimport Clock, Grid, NetworkBudget, WakeUp
+from jtqd.daemon.core.schedule cimport Clock, Grid, NetworkBudget, SyncGrid, WakeUp
 from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import snapshot as shared
@@ -43,14 +43,17 @@ RUN_ENDED: Final = 2
 
 cdef int64_t FIRST_CYCLES = STARTING_CYCLES, SNAPSHOT_EVERY = 8
 cdef int64_t CLOCK_READING_NS = 20_000  # both clocks are read within this, or their difference is not taken
+cdef int64_t PATIENCE_NS = 5_000_000, SILENCE_NS = 20_000_000  # without SYNC: until the duties, until nothing is fresh
 cdef int64_t LAST_CALL_NS = 100_000  # before the next SYNC: nobody waits for inputs from here on
 cdef int LAST_NUMBER = 240  # of the cycles of a SYNC without counter, in estimate PDO and record
 cdef int ENDED = CYCLE_ENDED, PASSED = SLOT_PASSED, OVER = RUN_ENDED
 cdef uint32_t COMPLETE = cr.FLAG_COMPLETE, PUBLISHED = cr.FLAG_PUBLISHED, WITHDRAWN = cr.FLAG_WITHDRAWN
 cdef uint32_t BEFORE_NEXT_SYNC = cr.FLAG_BEFORE_NEXT_SYNC, SYNC_CONFIRMED = cr.FLAG_SYNC_CONFIRMED
 cdef uint32_t RESET = cr.FLAG_RESET
-cdef uint32_t SYNC = SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
-cdef uint8_t OPERATIONAL = nmt.OPERATIONAL
+cdef uint32_t NMT_COMMAND = 0, SYNC = SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
+cdef uint8_t OPERATIONAL = nmt.OPERATIONAL, PRE_OPERATIONAL = nmt.PRE_OPERATIONAL, BOOT_UP = nmt.BOOT_UP
+cdef int START = nmt.START, RESET_NODE = nmt.RESET_NODE, RESET_COMMUNICATION = nmt.RESET_COMMUNICATION
+cdef dict STATE_AFTER = nmt.STATE_AFTER
 cdef int STALE = st.STALE, OFF = st.OFF
 cdef int BUS_ERRORS = word_of("bus_errors"), OVERRUNS = word_of("overruns")
 cdef int LATCH_RESETS = word_of("latch_resets"), CONTACTS = word_of("contacts")
@@ -308,6 +311,11 @@ class ConfiguredNodes:
         self._snapshot, self._intake, self._joints = snapshot, intake, joints
         self._since = {node: snapshot.configured[node] for node in intake.unconfigured}
         self._doubts = list(snapshot.doubts)
+        self._trust()
+
+    def _trust(self):
+        for joint in self._joints:
+            joint.trust(not self._snapshot.unchecked[joint.node_id])
 
     def look(self):
         """Check for configured nodes between the inputs of a cycle and its estimate."""
@@ -334,6 +342,7 @@ class ConfiguredNodes:
             if now != before:
                 self._doubts[node] = now
                 self._intake.doubt(node)
+        self._trust()
 
 
 cdef class Cycle:
@@ -348,8 +357,8 @@ cdef class Cycle:
         node_id: own node-ID, added to the bases of estimate PDOs, contact PDOs and heartbeat.
         counter_overflow: SYNC counter runs 1..overflow (1019h); 0: SYNC without counter.
         wait_ns, deadline_ns: from SYNC to the wake-up for the inputs (it follows their arrival) and to the end of the wait.
-        heartbeat_cycles: cycles between two heartbeats.
-        grid: time grid; its slot is the current cycle's.
+        heartbeat_cycles: cycles between two heartbeats; 0: none.
+        grid: time grid; its slot is the current cycle's. A SyncGrid follows the SYNC of another node, whose NMT slave this is.
         contacts: watches for contacts of all joints; None: nobody does.
         shadows: estimators of each joint's shadow methods; left out: there are none.
 
@@ -415,6 +424,9 @@ cdef class Cycle:
             self.contact_frames[n] = _frame(CONTACT[n] + node_id, 4)
         self.heartbeat_frame = _frame(HEARTBEAT + node_id, 1)
         self.heartbeat_frame.data[0] = OPERATIONAL
+        self.node_id, self.sends, self.follows, self.slot_index = node_id, True, isinstance(grid, SyncGrid), -1
+        if self.follows:
+            self.seen, self.sends = grid, False
         self.configured_nodes = ConfiguredNodes(snapshot, intake, self.joints)
 
     def go_on(self, int slots, int64_t end_ns):
@@ -427,6 +439,11 @@ cdef class Cycle:
         cdef int64_t at_ns
         while slots:
             slots -= 1
+            if self.follows:
+                outcome = self.follow(end_ns)
+                if outcome != ENDED or not self.slot_begun:
+                    return outcome
+                continue
             if outcome == ENDED:
                 self.index += self.grid.advance(self.clock.monotonic())
             if self.clock.monotonic() < self.grid.slot_ns:
@@ -449,26 +466,37 @@ cdef class Cycle:
                 outcome = ENDED
         return outcome
 
-    cpdef int begin(self) except -1:
-        """Drain the frames received after the last cycle was closed, then send SYNC."""
-        cdef Intake intake = self.intake
-        cdef Frame sync
-        cdef int64_t before_ns, realtime_ns, at_ns
-        cdef int count, n
+    cdef int open_record(self) except -1:
+        """Begin the record of a cycle: what comes from here on is in it."""
+        cdef int n
         self.ring.begin()
         self.flags, self.next_flags = self.next_flags, 0
         for n in range(4):
-            self.counted[n] = intake.counters[COUNTED[n]]
-        count = self.drain()
-        if count:
-            self.ring.keep(self.bus.frames_c, self.bus.stamps_c, count)
-        self.counter = self.counter % (self.counter_overflow or LAST_NUMBER) + 1
-        intake.begin(self.counter)
+            self.counted[n] = self.intake.counters[COUNTED[n]]
+        return 0
+
+    cdef int64_t read_clocks(self) except? -1:
+        """Return CLOCK_MONOTONIC, and learn what CLOCK_REALTIME is ahead of it."""
+        cdef int64_t before_ns, realtime_ns, at_ns
         before_ns = self.clock.monotonic()
         realtime_ns = self.clock.realtime()
         at_ns = self.clock.monotonic()
         if at_ns - before_ns < CLOCK_READING_NS or not self.realtime_offset_ns:
             self.realtime_offset_ns = realtime_ns - at_ns  # else something came between: the last one is better
+        return at_ns
+
+    cpdef int begin(self) except -1:
+        """Drain the frames received after the last cycle was closed, then send SYNC."""
+        cdef Frame sync
+        cdef int64_t at_ns
+        cdef int count
+        self.open_record()
+        count = self.drain()
+        if count:
+            self.ring.keep(self.bus.frames_c, self.bus.stamps_c, count)
+        self.counter = self.counter % (self.counter_overflow or LAST_NUMBER) + 1
+        self.intake.begin(self.counter)
+        at_ns = self.read_clocks()
         sync = _frame(SYNC, 1 if self.counter_overflow else 0)
         sync.data[0] = self.counter  # of a plain SYNC behind its end: not on the wire, but in our own echo
         self.send(&sync)
@@ -485,13 +513,15 @@ cdef class Cycle:
         self.work_start_ns = self.clock.monotonic()
         deadline_ns = min(self.sync_ns + self.wake_up.deadline_ns, self.grid.end_ns() - LAST_CALL_NS)
         while True:
-            count = self.receive()
+            count = self.receive() if not self.follows else self.take_until_sync()
             if count:
-                for n in range(count):
+                for n in range(self.first, self.first + count):
                     intake.take_frame(&self.bus.frames_c[n], self.bus.stamps_c[n], self.bus.own_c[n])
-                self.ring.keep(self.bus.frames_c, self.bus.stamps_c, count)
+                self.ring.keep(&self.bus.frames_c[self.first], &self.bus.stamps_c[self.first], count)
                 if intake.missing == 0:
                     break
+            if self.next_sync:
+                break
             left_ns = deadline_ns - self.clock.monotonic()
             if left_ns <= 0 or not self.bus.ready(left_ns):
                 break
@@ -510,7 +540,7 @@ cdef class Cycle:
     cpdef int observe(self) except -1:
         """Estimate every joint from the inputs of this cycle; without their networks if there is no time for them."""
         cdef int64_t sync_ns = self.sync_realtime_ns - self.realtime_offset_ns
-        cdef bint starting = self.index < FIRST_CYCLES, wanted
+        cdef bint starting = self.index - self.first_index < FIRST_CYCLES, wanted
         cdef int n
         self.budget.begin(self.grid.end_ns())
         for n in range(self.count):
@@ -529,19 +559,18 @@ cdef class Cycle:
             self.withdraw(STALE)
             self.flags |= WITHDRAWN
             self.writer.counters[OVERRUNS] += 1
-        if self.send_estimate():
+        if self.sends and self.send_estimate():
             self.flags |= PUBLISHED
             if self.clock.monotonic() < self.grid.end_ns():
                 self.flags |= BEFORE_NEXT_SYNC
         self.sent_ns = self.clock.monotonic()
         at_ns = self.sent_ns + self.realtime_offset_ns
-        for n in range(self.estimates):
-            self.ring.keep(&self.estimate_frames[n], &at_ns, 1)
-        for n in range(self.contact_pdos):
-            self.ring.keep(&self.contact_frames[n], &at_ns, 1)
-        if self.index >= self.heartbeat_due:
-            self.heartbeat_due = self.index + self.heartbeat_cycles
-            self.send(&self.heartbeat_frame)
+        if self.sends:
+            for n in range(self.estimates):
+                self.ring.keep(&self.estimate_frames[n], &at_ns, 1)
+            for n in range(self.contact_pdos):
+                self.ring.keep(&self.contact_frames[n], &at_ns, 1)
+        self.beat()
 
     cpdef int record(self) except -1:
         """Estimate by the shadow methods, write the cycle to the ring, update counters and, every n-th cycle, the snapshot."""
@@ -606,8 +635,128 @@ cdef class Cycle:
     def leave(self):
         """Send a last estimate with status off, so that no receiver keeps the last torque."""
         self.withdraw(OFF)
-        self.send_estimate()
+        if self.sends:
+            self.send_estimate()
         self.write_snapshot()
+
+    cdef int beat(self) except -1:
+        """Send the heartbeat when it is due."""
+        if self.index >= self.heartbeat_due and self.heartbeat_cycles:
+            self.heartbeat_due = self.index + self.heartbeat_cycles
+            self.send(&self.heartbeat_frame)
+        return 0
+
+    # As a guest: SYNC and NMT commands of another node ------------------------------------------------------------------
+
+    cdef int follow(self, int64_t end_ns) except -1:
+        """Wait for a SYNC (`slot_begun`) and go through its cycle; without one return soon. Returns as `go_on`.
+
+        A cycle is missed where the next SYNC has come before its inputs were taken.
+        """
+        cdef int64_t now_ns, until_ns = self.clock.monotonic() + PATIENCE_NS
+        cdef uint64_t errors = self.writer.counters[BUS_ERRORS]
+        cdef int count, n
+        self.slot_begun = False
+        if not self.opened:
+            self.open_record()
+            self.opened = True
+        while not self.slot_begun:
+            now_ns = self.clock.monotonic()
+            if end_ns and now_ns >= end_ns:
+                return OVER
+            count = self.take_until_sync()
+            for n in range(self.first, self.first + count):
+                self.intake.drain_frame(&self.bus.frames_c[n], self.bus.stamps_c[n], self.bus.own_c[n])
+            self.ring.keep(&self.bus.frames_c[self.first], &self.bus.stamps_c[self.first], count + self.next_sync)
+            if self.next_sync:
+                self.next_frame += 1
+                self.begin_with(&self.bus.frames_c[self.first + count], self.bus.stamps_c[self.first + count])
+                break
+            if now_ns >= until_ns:
+                return self.go_without(now_ns)
+            if self.writer.counters[BUS_ERRORS] > errors:  # the bus is down, and is ready to report it at any time
+                self.clock.sleep_until(until_ns)
+            self.bus.ready(until_ns - now_ns)
+        self.opened = False
+        self.gather()
+        if self.next_sync:
+            self.grid.missed += 1
+            return ENDED
+        self.observe()
+        self.publish()
+        self.record()
+        return ENDED
+
+    cdef int take_until_sync(self) except -1:
+        """Return how many frames, from `first` of the batch on, stand before a SYNC in it (`next_sync`), or before its end."""
+        cdef const Frame *frame
+        if self.next_frame == self.batch:
+            self.batch, self.next_frame = self.receive(), 0
+        self.first, self.next_sync = self.next_frame, False
+        while self.next_frame < self.batch:
+            frame = &self.bus.frames_c[self.next_frame]
+            if frame.id == SYNC and frame.length <= 1:
+                self.next_sync = True
+                break
+            if frame.id == NMT_COMMAND and frame.length == 2:
+                self.obey(frame.data[0], frame.data[1])
+            self.next_frame += 1
+        return self.next_frame - self.first
+
+    cdef int begin_with(self, const Frame *sync, int64_t stamp_ns) except -1:
+        """Begin a cycle with a SYNC of another node, seen at `stamp_ns` (CLOCK_REALTIME)."""
+        cdef int64_t slots
+        self.read_clocks()
+        self.sync_ns = stamp_ns - self.realtime_offset_ns
+        if self.slot_index < 0:  # the first one
+            self.first_index, self.slot_index = self.index, self.index - 1
+            self.grid.slot_ns = self.sync_ns - self.grid.period_ns
+        self.late_ns = self.sync_ns - self.grid.slot_ns
+        slots = self.seen.seen(self.sync_ns)
+        self.late_ns -= slots * self.grid.period_ns
+        self.index = self.slot_index = max(self.index, self.slot_index + slots)
+        self.counter = self.counter % (self.counter_overflow or LAST_NUMBER) + 1
+        if self.counter_overflow and sync.length and 0 < sync.data[0] <= self.counter_overflow:
+            self.counter = sync.data[0]
+        self.intake.begin_seen(self.counter, stamp_ns, self.seen.regular, slots)
+        self.slot_begun, self.quiet = True, False
+        return 0
+
+    cdef int go_without(self, int64_t now_ns) except -1:
+        """Go on without SYNC: the index follows time, the heartbeat is sent; after SILENCE_NS no estimate looks fresh."""
+        cdef int64_t silent_ns
+        self.grid.slot_ns = self.grid.slot_ns or now_ns
+        silent_ns = now_ns - self.grid.slot_ns
+        self.index = max(self.index, self.slot_index + silent_ns // self.grid.period_ns)
+        if silent_ns > SILENCE_NS + 2 * self.grid.period_ns:
+            if not self.quiet and self.slot_index >= 0:
+                self.withdraw(STALE)
+            self.quiet = True
+            self.write_snapshot()
+        self.beat()
+        return ENDED
+
+    cpdef int reset_communication(self) except -1:
+        """Send the boot-up message, and be pre-operational, as an NMT slave begins."""
+        self.heartbeat_frame.data[0] = BOOT_UP
+        self.send(&self.heartbeat_frame)
+        return self.enter(PRE_OPERATIONAL)
+
+    cdef int obey(self, int number, int node) except -1:
+        """Obey an NMT command, unless there is no heartbeat; other nodes that leave operational may get another mapping."""
+        if number != START:
+            self.intake.idle(node)
+        if node not in (0, self.node_id) or not self.heartbeat_cycles:
+            return 0
+        if number in (RESET_NODE, RESET_COMMUNICATION):
+            return self.reset_communication()
+        return self.enter(STATE_AFTER.get(number, self.heartbeat_frame.data[0]))
+
+    cdef int enter(self, uint8_t state) except -1:
+        """Enter an NMT state; the supervisor reads it where those of the other nodes are."""
+        self.heartbeat_frame.data[0] = self.intake.nodes.state[self.node_id] = state
+        self.sends = state == OPERATIONAL
+        return 0
 
     cdef void withdraw(self, int status) noexcept:
         """Withdraw the estimates of all joints (`JointCycle.withdraw`)."""

@@ -73,6 +73,8 @@ cdef class Intake:
     cdef void drained(self) noexcept nogil
     cdef int without_own(self, Frame *frames, int64_t *stamps_ns, bint *own, int count) noexcept nogil
     cpdef void pass_slot(self) noexcept
+    cdef void idle(self, int node_id) noexcept nogil
+    cdef void begin_seen(self, int counter, int64_t stamp_ns, bint regular, int64_t slots) noexcept
     cdef Input *input_with(self, uint32_t can_id) noexcept nogil
     cdef Temperature *temperature_with(self, uint32_t can_id) noexcept nogil
     cdef void wrong_length(self, Input *state, int length) noexcept nogil

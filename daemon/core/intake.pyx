@@ -19,6 +19,7 @@ the same PDO can still be under way:
   then the input is not used in that cycle;
 * a wrong length, a 29-bit identifier or a remote frame under one of our identifiers is rejected and counted;
 * a SYNC that is not our own echo makes every input of the cycle doubtful: none is used;
+* where another node sends SYNC (`begin_seen`), the SYNC seen takes the place of the echo, and only its own pauses are gaps;
 * a frame with a COB-ID that only the loop may use, and that is no own echo, is a conflict: counted, and used for nothing;
 * a node that sent its boot-up message has lost its PDO mapping: its PDOs are neither used nor waited for until it has been
   configured again. The same holds for one whose configuration was changed, and for an optional one that is absent.
@@ -450,6 +451,27 @@ cdef class Intake:
         self.gap.length += 1
         self.gap.pause = PAUSE
 
+    cdef void idle(self, int node_id) noexcept nogil:
+        """A node, or every one (0), was commanded to leave operational: it is in doubt until it has been started again."""
+        cdef int n
+        for n in range(NODES):
+            if self.is_producer[n] and node_id in (0, n):
+                self.believe(n, False)
+
+    cdef void begin_seen(self, int counter, int64_t stamp_ns, bint regular, int64_t slots) noexcept:
+        """Begin a cycle by the SYNC of another node, in place of an own one and its echo.
+
+        regular: it comes as configured, else no input of the cycle is used; slots: since the last one. What was late has come
+        in LONGEST of them.
+        """
+        if slots > LONGEST:
+            self.gap.open, self.gap.arrivals = True, 0
+        self.begin(counter)
+        self.sync_stamp_ns = stamp_ns
+        if not regular:
+            self.foreign_sync_now = True
+            self.counters[SYNC_ERRORS] += 1
+
     cdef Input *input_with(self, uint32_t can_id) noexcept nogil:
         """Return the PDO with this identifier, NULL for none."""
         cdef int n = self.input_of[can_id] if can_id < IDENTIFIERS else -1
@@ -539,7 +561,7 @@ cdef class Intake:
             self.counters[REJECTED_FRAMES] += 1
         elif identifier == SYNC or self.is_heartbeat(identifier):
             self.counters[REJECTED_FRAMES] += 1
-        elif not own:
+        elif not own and can_id:  # 0: an NMT command, which a guest obeys
             self.counters[UNKNOWN_FRAMES] += 1
 
     # Temperatures -----------------------------------------------------------------------------------------------------

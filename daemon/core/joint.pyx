@@ -79,7 +79,7 @@ cdef class JointCycle:
         self, int number, inputs, estimator, *, Intake intake, snapshot, int64_t period_ns, safety=None, shadows=()
     ):
         cdef JointBlock nothing = JointBlock(
-            NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, 0, 0, 0
+            NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, STARTING, 0, 0
         )
         joint = getattr(estimator, "joint", None)
         self.rules = JointRules(number, snapshot, safety or JointSafety(), estimator.with_network)
@@ -156,6 +156,10 @@ cdef class JointCycle:
         self.rules.begin_again()
         for each in () if self.shadows is None else self.shadows.estimators:
             each.reset()
+
+    def trust(self, bint trusted):
+        """Let the status be better than degraded, or not: nobody has checked that these are the drive's inputs."""
+        self.rules.at_most_degraded = not trusted
 
     def reset_latch(self):
         """Release the latched faults and restart with the present encoder positions; return whether there was one."""

@@ -15,6 +15,11 @@ cdef class Grid:
     cpdef bint too_late(self, int64_t now_ns) noexcept
     cdef int64_t end_ns(self) noexcept
 
+cdef class SyncGrid(Grid):
+    cdef int64_t mean_ns, near, due_ns  # of intervals; share of those near the period; where the last SYNC was due
+    cdef readonly bint regular
+    cdef int64_t seen(self, int64_t sync_ns) noexcept
+
 cdef class WakeUp:
     cdef readonly int64_t wait_ns, deadline_ns
     cpdef void follow(self, int64_t last_delay_ns) noexcept

@@ -18,6 +18,7 @@ FORGET_CYCLES: Final = 1024
 
 cdef int64_t STEP_NS = 160, MARGIN_NS = 10_000, SHORTEST_NS = 50_000  # of `WakeUp`
 cdef int64_t RESERVE_NS = RESERVED_NS, FORGET = FORGET_CYCLES, SETTLE = 16  # cycles with the network
+cdef int64_t MEAN_OF = 16, DRIFT = 64, ALL = 1 << 20  # of SYNCs of another node: intervals, SYNCs, share
 
 cdef enum:
     TIMER_ABSTIME = 1
@@ -106,6 +107,39 @@ cdef class Grid:
     cdef int64_t end_ns(self) noexcept:
         """Return when the next SYNC is due."""
         return self.slot_ns + self.period_ns
+
+
+cdef class SyncGrid(Grid):
+    """Grid of a SYNC that another node sends: its slots stand where the SYNC was seen; it skips none.
+
+    regular: SYNC comes with the period: not with a mean interval below 0.9 periods (two producers), nor above 1.1 where few
+    intervals are near the period (a producer that misses slots has many).
+    """
+
+    def __init__(self, int64_t period_ns):
+        self.period_ns = self.mean_ns = period_ns
+        self.near, self.regular = ALL, True
+
+    cpdef int64_t advance(self, int64_t now_ns) noexcept:
+        return 0
+
+    cdef int64_t end_ns(self) noexcept:
+        """Return when the next SYNC may come: its producer is late at times, early never."""
+        return self.due_ns + self.mean_ns
+
+    cdef int64_t seen(self, int64_t sync_ns) noexcept:
+        """Take a SYNC; return the slots since the last one, at least 1."""
+        cdef int64_t period_ns = self.period_ns, interval_ns = sync_ns - self.slot_ns, late_ns
+        cdef int64_t slots = max(1, (interval_ns + period_ns // 2) // period_ns)
+        cdef int64_t near = ALL if -period_ns <= 10 * (interval_ns - period_ns) <= period_ns else 0
+        self.slot_ns = sync_ns
+        self.mean_ns += (max(0, min(interval_ns, 2 * period_ns)) - self.mean_ns) // MEAN_OF
+        self.near += (near - self.near) * min(slots, 4) // MEAN_OF
+        self.regular = 10 * self.mean_ns >= 9 * period_ns and (10 * self.mean_ns <= 11 * period_ns or 4 * self.near >= ALL)
+        late_ns = sync_ns - self.due_ns - slots * self.mean_ns if self.due_ns else 0
+        late_ns = max(0, min(late_ns, period_ns // 4))
+        self.due_ns = sync_ns - late_ns + late_ns // DRIFT
+        return slots
 
 
 cdef class WakeUp:

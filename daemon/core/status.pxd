@@ -32,7 +32,7 @@ cdef class JointRules:
     cdef int number
     cdef JointStatus status
     cdef Plausibility plausibility
-    cdef bint is_checked, with_network
+    cdef bint is_checked, with_network, at_most_degraded
     cdef double torque_limit_nm, sigma_limit_nm, network_limit_nm, deviation_sigmas, sensor_variance
     cdef int64_t deviation_cycles, deviates
     cdef double bandwidth, max_gap, age_ms

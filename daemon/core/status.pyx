@@ -326,6 +326,8 @@ cdef class JointRules:
             found |= self.faults_of(estimate, reference_nm, network_wanted)
             if starting:
                 status = STARTING
+            elif self.at_most_degraded:
+                status = DEGRADED
         elif status == INVALID:
             found |= FAULT_OUT_OF_RANGE
         status = self.status.update(status, found)

@@ -159,6 +159,7 @@ def build(
     *,
     slots: int = 64,
     counter_overflow: int = 240,
+    heartbeat_cycles: int = 100,
     **options: Any,
 ) -> tuple[Cycle, RingReader]:
     """A cycle on memory in this directory."""
@@ -173,7 +174,7 @@ def build(
         counter_overflow=counter_overflow,
         wait_ns=0,
         deadline_ns=100_000,
-        heartbeat_cycles=100,
+        heartbeat_cycles=heartbeat_cycles,
         grid=grid,
         **options,
     )
