@@ -231,6 +231,10 @@ LONGEST_CONTACT_PERIOD_US: Final = 5000
 ERROR_BEHAVIOURS: Final = ("pre_operational", "none", "stopped")
 """1029h:1 in the order of its values."""
 
+MASTER, GUEST, LISTENER = "master", "guest", "listener"
+ROLES: Final = (MASTER, GUEST, LISTENER)
+"""Who sends SYNC and configures the nodes: jtqd, or another node, to which jtqd is an NMT slave, or not there at all."""
+
 NodeId = Annotated[int, limits(ge=1, le=MAX_NODE_ID)]
 _SdoTimeout = Annotated[int, limits(ge=10, le=10_000)]
 """Silence of a node [ms] after which an SDO request is repeated."""
@@ -327,6 +331,8 @@ class JointSection:
     """Of shadow methods, by method."""
     profile: Text | None = None
     """Of the drive's family: gives the values that the section does not have (`with_profiles`)."""
+    eds: Text | None = None
+    """Its EDS or DCF, beside the configuration: layout and scaling for a guest."""
 
     def __post_init__(self) -> None:
         check_given("joint", self.given, EVERY_SCALING_OBJECT)
@@ -356,6 +362,8 @@ class SensorSection:
     unit_words: _Given = field(default_factory=dict)
     mandatory: bool = False
     sdo_timeout_ms: _SdoTimeout | None = None
+    eds: Text | None = None
+    """As of a joint."""
 
     def __post_init__(self) -> None:
         check_given("sensor", self.given, SENSOR_SCALING_OBJECTS)
@@ -505,6 +513,7 @@ class ConfigFile:
     joint_2: JointSection | None = None
     joint_3: JointSection | None = None
     joint_4: JointSection | None = None
+    role: Annotated[str, choice(ROLES)] = MASTER
     bitrate: Annotated[int, limits(ge=10_000, le=1_000_000)] = 1_000_000
     sync: _Sync = _Sync()
     inputs: _Inputs = _Inputs()
@@ -648,6 +657,9 @@ class JointConfig:
     profile_path: Path | None = None
     profile_data: bytes = field(default=b"", repr=False)
     """The profile as it was read, for the log."""
+    eds: Path | None = None
+    pinned: bool = False
+    """The configuration names its TPDOs."""
 
     @property
     def joint_sha256(self) -> str:
@@ -669,6 +681,7 @@ class SensorConfig:
     """jtqd does not start without it. By default it does, and configures the sensor when it appears."""
     sdo_timeout_ms: int
     """As of a joint."""
+    eds: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -707,6 +720,7 @@ class Config:
     """None: contacts are not detected."""
     shadow: tuple[str, ...] = ()
     """Methods of every joint that are computed and never sent."""
+    role: str = MASTER
 
     @property
     def shadows(self) -> tuple[Config, ...]:
@@ -756,8 +770,8 @@ def as_booted(config: Config, nodes: Mapping[str, Mapping[str, Any]]) -> Config:
     return replace(config, joints=tuple(of(joint) for joint in config.joints))
 
 
-def load_config(path: Path | None) -> Config:
-    """Read and check a configuration; None is the shipped bench configuration.
+def load_config(path: Path | None, role: str | None = None) -> Config:
+    """Read and check a configuration; None is the shipped bench configuration. role: in place of the file's.
 
     Raises:
         ConfigError: one line naming file, key, what was found and what was expected.
@@ -791,13 +805,14 @@ def load_config(path: Path | None) -> Config:
         ),
         safety=file.safety,
         joints=joints,
-        sensor=None if file.sensor is None else _sensor(file.sensor, file.nodes.sdo_timeout_ms),
+        sensor=None if file.sensor is None else _sensor(file.sensor, file.nodes.sdo_timeout_ms, path),
         realtime=file.realtime,
         recording=file.recording,
         metrics_file=None if file.metrics is None else Path(file.metrics.file),
         ros2=file.ros2,
         contact=file.contact,
         shadow=file.estimator.shadow,
+        role=role or file.role,
     )
 
 
@@ -815,7 +830,7 @@ def _check_one_sensor(mapping: Mapping[str, object]) -> None:
             raise FieldError("configuration", key, found, expected)
 
 
-def _sensor(section: SensorSection, sdo_timeout_ms: int) -> SensorConfig:
+def _sensor(section: SensorSection, sdo_timeout_ms: int, path: Path) -> SensorConfig:
     return SensorConfig(
         node_id=section.node,
         identity=section.identity,
@@ -824,6 +839,7 @@ def _sensor(section: SensorSection, sdo_timeout_ms: int) -> SensorConfig:
         unit_words=dict(section.unit_words),
         mandatory=section.mandatory,
         sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
+        eds=path.parent / section.eds if section.eds else None,
     )
 
 
@@ -880,6 +896,8 @@ def _joint(path: Path, number: int, file: ConfigFile) -> JointConfig:
         profile=section.profile,
         profile_path=profile_path,
         profile_data=b"" if profile_path is None else read_yaml(profile_path)[1],
+        eds=path.parent / section.eds if section.eds else None,
+        pinned=bool(section.tpdos),
     )
 
 

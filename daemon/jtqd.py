@@ -23,6 +23,7 @@ _EXAMPLES = """examples:
   jtqd --bus vcan0                      SocketCAN interface, until Ctrl-C or SIGTERM
   jtqd --bus unix:/run/bench.sock       frame socket of `jtq sim --bus unix:/run/bench.sock`
   jtqd --bus can0 --config /etc/jtqd/arm.yaml --record /var/log/jtqd
+  jtqd --bus can0 --config arm/jtqd.yaml --guest     beside a PLC that is the master of the bus
   jtqd --bus can0 --ros2                joint states, torque states and diagnostics for ROS 2 nodes of this machine
   jtqd --bus can0 --live                open ws://127.0.0.1:8765 in Foxglove, with the layout of `jtq layout`
 
@@ -50,6 +51,11 @@ def parser() -> argparse.ArgumentParser:
     add("--live", type=address, nargs="?", const=Address(), metavar="HOST:PORT", help=text)
     text = "publish for ROS 2, 100 Hz, on loopback unless the configuration (ros2) states otherwise (extra: ros2)"
     add("--ros2", action="store_true", help=text)
+    roles = result.add_mutually_exclusive_group()
+    text = "another node is the master: follow its SYNC, obey its NMT commands, ask nothing (docs/bus.md; role: guest)"
+    roles.add_argument("--guest", dest="role", action="store_const", const="guest", help=text)
+    text = "as --guest, and send nothing at all (role: listener)"
+    roles.add_argument("--listener", dest="role", action="store_const", const="listener", help=text)
     add("--json", action="store_true", help="print the final summary as JSON")
     add("--version", action="version", help="print the version", version=f"jtqd {__version__}")
     return result
@@ -104,7 +110,7 @@ def _run(arguments: argparse.Namespace, stop_requests: list[int]) -> int:
     from jtqd.estimator.errors import ConfigError
 
     try:
-        config = load_config(arguments.config)
+        config = load_config(arguments.config, arguments.role)
         wants_ros2 = arguments.ros2 or config.ros2 is not None
         if wants_ros2 and not ros2.installed():
             who = "--ros2" if arguments.ros2 else f"{config.path}: key 'ros2':"

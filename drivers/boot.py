@@ -10,6 +10,8 @@ The request is a `BootRequest`; all keys but "bus", "nodes", "node" and "kind" h
 The report is
     {"ok": true, "duration_s", "nodes": {"1": {...}}, "absent": {"3": error}}               exit status 0
     {"ok": false, "error": {"node", "object", "expected", "found", "letter", "message"}}    exit status 1
+A guest's boot ("guest") asks nothing: it listens, and takes the nodes as files and request have them (`known_nodes`). Its
+report also has "identities" (expected 1018h by node) and "unchecked": nodes whose layout is neither checked nor pinned.
 With an EDS it also has the entries of that file as "own_entries": the caller needs no parser then, which takes 20 MB.
 A node that comes back is booted by the same command with a shorter list of nodes.
 
@@ -25,11 +27,13 @@ import select
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from math import inf
+from statistics import median
 from typing import Annotated, Any, Self
 
 import msgspec
@@ -45,14 +49,30 @@ from jtqd.drivers.boot_node import (
     Profile,
     reset_during_boot,
 )
-from jtqd.drivers.bus_socket import exact
+from jtqd.drivers.bus_socket import CanFilter, exact
 from jtqd.drivers.drive import BY_TORQUE, CIA_402, DriveObjects, DriveProfile, Temperature, map_of
 from jtqd.drivers.emcy import EMCY_BASE, HISTORY_INDEX, Emergency, name_of, parse, register_text
-from jtqd.drivers.frame import FRAME, FRAME_SIZE
+from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_RTR_FLAG, FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
-from jtqd.drivers.object_dictionary import ANY_IDENTITY, Identity, entries_to_json, read_eds
-from jtqd.drivers.pdo import SYNC_LISTEN_S, Tpdo
-from jtqd.drivers.sdo import ANSWER_S, PATIENCE, RESPONSE_ID, Key, SdoAbort, SdoClient, SdoTimeout, parse_key
+from jtqd.drivers.object_dictionary import (
+    ANY_IDENTITY,
+    EdsError,
+    Identity,
+    ObjectStore,
+    entries_to_json,
+    read_eds,
+)
+from jtqd.drivers.pdo import SYNC_COB_ID, SYNC_LISTEN_S, TPDO_BASES, Tpdo
+from jtqd.drivers.sdo import (
+    ANSWER_S,
+    PATIENCE,
+    RESPONSE_ID,
+    Key,
+    SdoAbort,
+    SdoClient,
+    SdoTimeout,
+    parse_key,
+)
 from jtqd.drivers.sensor import SensorProfile
 
 # The request
@@ -73,6 +93,8 @@ class _Node(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_f
         given: values of scaling objects that are then not read, by object: {"6091h:1": 100}.
         sdo_timeout_ms: silence of the node after which a request is repeated.
         mandatory: the boot fails without it.
+        eds: its EDS or DCF, for a guest.
+        pinned: its layout is that of the request, whatever the EDS has.
     """
 
     node: NodeId
@@ -80,6 +102,8 @@ class _Node(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_f
     given: dict[str, _Word] = {}
     sdo_timeout_ms: Annotated[int, Meta(ge=10, le=10_000)] | None = None
     mandatory: bool = True
+    eds: str = ""
+    pinned: bool = False
 
     @property
     def given_values(self) -> dict[Key, int]:
@@ -136,12 +160,16 @@ class BootRequest(BusSettings, frozen=True, kw_only=True, forbid_unknown_fields=
         bus: CAN interface or unix:PATH.
         answer_timeout_s: longest wait for the answer of a mandatory node.
         reset: begin with NMT reset communication.
+        guest: another node is the master. listener: nobody but it sends with jtqd's node-ID. period_us: of its SYNC.
     """
 
     bus: Annotated[str, Meta(min_length=1)]
     nodes: Annotated[tuple[DriveNode | SensorNode, ...], Meta(min_length=1)]
     answer_timeout_s: Annotated[float, Meta(gt=0.0, le=60.0)] = 0.5
     reset: bool = True
+    guest: bool = False
+    listener: bool = False
+    period_us: float = 1000.0
 
     def __post_init__(self) -> None:
         numbers = [each.node for each in self.nodes]
@@ -344,7 +372,7 @@ class BootBus:
         if self._syncs:
             # it would make every input's cycle ambiguous
             where = f"COB-ID {self._settings.sync.cob_id:03X}h"
-            detail = f"another SYNC producer is on the bus ({where}, {self._syncs} frames during boot)"
+            detail = f"another SYNC producer is on the bus ({where}, {self._syncs} frames): jtqd --guest runs beside it"
             raise BootError(None, where, expected="no SYNC", found=f"{self._syncs} frames", detail=detail)
         if self._own_ids:
             node, where = self._settings.master_node, f"COB-ID {self._own_id:03X}h"
@@ -487,11 +515,88 @@ def _require_operational(bus: BootBus, node: int, wait_s: float) -> None:
         raise BootError(node, "NMT state", expected="operational", found=found, detail=detail)
 
 
+# As a guest: a bus that another master has booted, or will
+
+_LISTEN_S, _FEW, _PERIOD_OFF = 1.2, 5, 0.1
+"""A heartbeat of once a second is heard; SYNCs that make a period; its largest difference, as a share."""
+
+
+def known_nodes(
+    request: BootRequest, ids: Collection[int], syncs: Sequence[tuple[int, int]]
+) -> dict[str, Any]:
+    """Return the report of a bus that was listened to; `syncs`: (stamp [ns], length). Raises BootError, EdsError."""
+    notes = _check_sync(request, syncs)
+    bases = [] if request.listener else [*TPDO_BASES, EMCY_BASE, RESPONSE_ID, nmt.HEARTBEAT_BASE]
+    for cob_id in (base + request.master_node for base in bases):
+        if cob_id in ids:
+            where, detail = (
+                f"COB-ID {cob_id:03X}h",
+                f"node {request.master_node:02X}h, jtqd's own node-ID, is on the bus",
+            )
+            raise BootError(
+                None, where, expected="no such node", found="frames", detail=f"{detail} ({where})"
+            )
+    booted: dict[int, BootedNode] = {}
+    absent: dict[int, BootError] = {}
+    identities = {}
+    for each in request.nodes:
+        node, store = each.node, ObjectStore(read_eds(each.eds, each.node) if each.eds else [], each.node)
+        try:
+            booted[node] = NodeBoot(store, each.profile, request).describe(pinned=each.pinned, eds=each.eds)
+        except BootError as error:
+            if each.mandatory:
+                raise
+            absent[node] = error
+        given, of_eds = (
+            each.identity,
+            [store.number(0x1018, sub) if store.has(0x1018, sub) else 0 for sub in (1, 2)],
+        )
+        numbers = (given.vendor or of_eds[0], given.product or of_eds[1], given.revision, given.serial)
+        identities[str(node)] = {str(sub): number for sub, number in enumerate(numbers, 1) if number}
+    report = BootReport(booted, _LISTEN_S, absent).as_json()
+    unchecked = [each.node for each in request.nodes if each.node in booted and not each.pinned]
+    return {**report, "identities": identities, "unchecked": unchecked, "notes": notes}
+
+
+def _check_sync(request: BootRequest, syncs: Sequence[tuple[int, int]]) -> list[str]:
+    """Check the SYNC of the master; return what the operator should know. Raises BootError."""
+    if len(syncs) < _FEW:
+        return [f"no SYNC within {_LISTEN_S:g} s: jtqd waits for that of the master"]
+    period_us = median(after - before for (before, _), (after, _) in pairwise(syncs)) / 1e3
+    wanted_us, counts, expects = request.period_us, syncs[-1][1] > 0, bool(request.sync.counter_overflow)
+    if abs(period_us - wanted_us) > _PERIOD_OFF * wanted_us:
+        expected = f"one every {wanted_us:g} us (sync.period_us)"
+        raise BootError(None, "SYNC", expected=expected, found=f"one every {period_us:.0f} us")
+    if expects and not counts:
+        raise BootError(None, "SYNC", expected="a counter byte (sync.counter_overflow)", found="none")
+    text = "SYNC has a counter byte: with sync.counter_overflow (1019h of the master) the sequence follows it"
+    return [text] if counts and not expects else []
+
+
+def listen(bus: str, seconds: float) -> tuple[set[int], list[tuple[int, int]]]:
+    """Return the COB-IDs heard on a bus, and the SYNCs as (stamp [ns], length). Raises BusError."""
+    ids, syncs, end = set(), [], time.monotonic() + seconds
+    with closing(open_frame_socket(bus, [CanFilter(0, CAN_EFF_FLAG | CAN_RTR_FLAG)])) as socket:
+        while (left := end - time.monotonic()) > 0.0:
+            socket.wait(left)
+            for at in range(socket.receive()):
+                can_id, length, _ = FRAME.unpack_from(socket.frames, FRAME_SIZE * at)
+                ids.add(can_id)
+                if can_id == SYNC_COB_ID:
+                    syncs.append((socket.stamps_ns[at], length))
+    return ids, syncs
+
+
 def main(argv: list[str]) -> int:
     """Read a request from standard input, boot, print the report; return the exit status. Never a traceback."""
     try:
         own = {"own_entries": entries_to_json(read_eds(argv[0], int(argv[1])))} if argv else {}
         request = parse_request(_read_request())
+        if request.guest:
+            with _errors_of_bus(request.bus):
+                heard = listen(request.bus, _LISTEN_S)
+            print(json.dumps(known_nodes(request, *heard) | own), flush=True)
+            return 0
         with _bus(request) as bus:
             report = boot(request, bus)
             print(json.dumps(report.as_json() | own), flush=True)
@@ -499,6 +604,8 @@ def main(argv: list[str]) -> int:
         return 0
     except BootError as error:
         failure = error
+    except EdsError as error:
+        failure = BootError(None, "EDS", detail=str(error))
     except (RequestError, json.JSONDecodeError) as error:
         failure = BootError(None, "request", detail=f"boot request: {error}")
     except KeyboardInterrupt:
@@ -511,14 +618,20 @@ def main(argv: list[str]) -> int:
 
 @contextmanager
 def _bus(request: BootRequest) -> Iterator[BootBus]:
-    """Open the bus; a BusError becomes a BootError of the bus."""
+    """Open the bus."""
+    with _errors_of_bus(request.bus), BootBus(request) as bus:
+        yield bus
+
+
+@contextmanager
+def _errors_of_bus(bus: str) -> Iterator[None]:
+    """Make a BusError a BootError of the bus."""
     try:
-        with BootBus(request) as bus:
-            yield bus
+        yield
     except BusError as error:
-        text = str(error).removeprefix(f"{request.bus}: ")
-        detail = f"bus {request.bus}: {text}"
-        raise BootError(None, request.bus, expected="a bus", found=text, detail=detail) from error
+        text = str(error).removeprefix(f"{bus}: ")
+        detail = f"bus {bus}: {text}"
+        raise BootError(None, bus, expected="a bus", found=text, detail=detail) from error
 
 
 def _read_request() -> object:

@@ -21,6 +21,7 @@ from msgspec import Meta, Struct
 
 from jtqd.drivers.drive import (
     EVENT_MS,
+    GEAR,
     DriveProfile,
     DriveScaling,
     LayoutError,
@@ -321,6 +322,22 @@ class TpdoSetup:
             return self._use_as_found(refused)
         return self._profile.tpdos
 
+    def described(self) -> tuple[PdoMap, ...]:
+        """Return the TPDOs with every quantity that an EDS or DCF has. Raises BootError."""
+        node, profile = self._profile.node_id, self._profile
+        found, unusable = self._found(only_valid=True)
+        try:
+            used = self._select(found)
+        except LayoutError as error:
+            detail = "; ".join((str(error), *unusable))
+            raise BootError(node, "1A00h", expected="its mapping", found="another", detail=detail) from None
+        allowed = (EVERY_SYNC, *(ACYCLIC if isinstance(profile, DriveProfile) and profile.acyclic else ()))
+        for pdo in used:
+            if pdo.transmission_type not in allowed and not _is_temperature(pdo):
+                key, expected = (tpdo_parameters(pdo.number)[0], 2), "1, or 0, 254, 255 with max_age_ms"
+                raise mismatch(node, key, "type", expected=expected, found=str(pdo.transmission_type))
+        return used
+
     def _as_wanted(self, pdo: PdoMap) -> bool:
         """Return whether a TPDO is valid and as wanted."""
         cob_id = self._objects.number((tpdo_parameters(pdo.number)[0], 1), 4)
@@ -430,12 +447,14 @@ class TpdoSetup:
         self._changes.clear()
         self._written.clear()
 
-    def _found(self) -> tuple[list[PdoMap], list[str]]:
+    def _found(self, *, only_valid: bool = False) -> tuple[list[PdoMap], list[str]]:
         """Read all TPDOs that there are; return those that can be used, and why others cannot."""
         maps, unusable = [], []
         objects = NodeObjects(self._objects.access, self._profile.node_id)  # values that are not in force
         for tpdo in read_tpdos(lambda key: objects.optional_number(key, 4)):
             try:
+                if only_valid and not tpdo.on:
+                    raise PdoError("it is switched off (bit 31 of its COB-ID)")
                 if tpdo.extended:
                     raise PdoError(f"TPDO{tpdo.number} has a 29-bit COB-ID")
                 maps.append(self._map_of(tpdo))
@@ -555,6 +574,38 @@ class NodeBoot:
             signed=signed,
             watched=watched,
             notes=tuple(self._notes),
+        )
+
+    def describe(self, *, pinned: bool, eds: str) -> BootedNode:
+        """Return the node as its EDS or DCF (`access`) and the configuration have it: nothing is asked, nothing is written.
+
+        pinned: its TPDOs are those of the configuration; eds: its file, "" for none. Raises BootError for what neither has.
+        """
+        objects, profile = self._objects, self._profile
+        missing = [label(*key) for key in profile.scaling_objects if not objects.optional_number(key, 4)]
+        missing += [] if pinned or eds else ["1A00h (mapping: 'tpdos')"]
+        if missing:
+            detail = f"not known: {', '.join(missing)}: a guest asks no node, expected in 'given' or in a DCF ('eds')"
+            raise BootError(self._node, missing[0], expected="a value", found="none", detail=detail)
+        tpdos = profile.tpdos if pinned else TpdoSetup(objects, profile, self._notes).described()
+        scaling, gear_ratio = self.read_scaling()
+        values = {**{key: objects.values[key] for key in profile.scaling_objects}, **profile.given}
+        watched = values.keys() - (
+            set() if isinstance(profile, DriveProfile) and profile.counts_at_shaft else {*GEAR}
+        )
+        for pdo in tpdos:
+            values |= {key: value for key, value, _, _ in _mapping_rows(pdo, pdo.transmission_type)}
+            values[tpdo_parameters(pdo.number)[0], 1] = pdo.cob_id
+        return BootedNode(
+            node_id=self._node,
+            name=printable(objects.best_effort((0x1008, 0)) or b""),
+            device_type=profile.profile_number,
+            serial=0,
+            scaling=scaling,
+            gear_ratio=gear_ratio,
+            tpdos=tpdos,
+            configuration_sha256=configuration_sha256(values),
+            watched=watched_objects(values, watched),
         )
 
     def check_device_type(self) -> int:

@@ -472,6 +472,12 @@ class DriveProfile:
         return tuple(key for key in EVERY_SCALING_OBJECT if key in used and key not in self.given)
 
     @property
+    def counts_at_shaft(self) -> bool:
+        """Whether 6091h scales a quantity."""
+        scaled = ((name, each) for name, each in self.objects.quantities().items() if name in SCALES)
+        return any(not each.factor and scale_of(name, each.by).at_shaft for name, each in scaled)
+
+    @property
     def used_scaling(self) -> set[Key]:
         """Scaling objects on which this drive's numbers depend, read or given."""
         used = set(GEAR)

@@ -13,7 +13,7 @@ EMCY_BASE = 0x080
 EMCY = struct.Struct("<HB5s")
 """Error code, error register (1001h), manufacturer's field."""
 NO_ERROR = 0x0000
-CAN_OVERRUN, CAN_PASSIVE, HEARTBEAT_LOST, BUS_OFF_RECOVERED = 0x8110, 0x8120, 0x8130, 0x8140
+NO_SYNC, CAN_OVERRUN, CAN_PASSIVE, HEARTBEAT_LOST, BUS_OFF_RECOVERED = 0x8100, 0x8110, 0x8120, 0x8130, 0x8140
 COB_ID_COLLISION = 0x8150
 JOINT_FAULT, FAULT_LATCHED, NODE_CHANGED = 0xFF01, 0xFF02, 0xFF03
 """Of jtqd: a joint has no torque because of a fault; a latched fault waits for its reset; a node is not configured as at its

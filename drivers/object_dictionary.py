@@ -312,6 +312,8 @@ def entries_from_json(rows: Any) -> list[Entry]:
 def _entry(variable: Any) -> Entry:
     """Return one variable of a parsed EDS, or member of an array or record."""
     data_type, default = int(variable.data_type), variable.default
+    if variable.value is not None:  # ParameterValue of a DCF: what the device is configured with
+        default = variable.value
     layout = _LAYOUTS.get(data_type)
     if layout is not None:
         default = layout.pack(default if default is not None else 0)

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.config import Config, as_booted
+from jtqd.daemon.config import LISTENER, MASTER, Config, as_booted
 from jtqd.daemon.shared.events import RateLimit
 from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
@@ -43,6 +43,8 @@ def boot_request(
             node=joint.node_id,
             identity=Identity(**asdict(joint.identity)),
             given=joint.given,
+            eds=str(joint.eds or ""),
+            pinned=joint.pinned,
             sdo_timeout_ms=joint.sdo_timeout_ms,
             mandatory=joint.mandatory or only is not None,
             temperature=joint.temperature,
@@ -62,6 +64,8 @@ def boot_request(
                 given=sensor.given,
                 sdo_timeout_ms=sensor.sdo_timeout_ms,
                 mandatory=sensor.mandatory or only is not None,
+                eds=str(sensor.eds or ""),
+                pinned=sensor.eds is None,
                 channels=sensor.channels,
                 unit_words=sensor.unit_words,
             )
@@ -78,6 +82,9 @@ def boot_request(
         error_behaviour=config.error_behaviour,
         reset=config.reset_communication if reset is None else reset,
         sync=Sync(counter_overflow=config.counter_overflow, check_foreign=only is None),
+        guest=config.role != MASTER,
+        listener=config.role == LISTENER,
+        period_us=config.period_ns / 1000,
     )
 
 

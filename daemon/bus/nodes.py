@@ -16,7 +16,7 @@ from jtqd.daemon.bus.boot import ReturningNodes
 from jtqd.daemon.shared.events import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers.boot_node import VERIFY_CONFIGURATION, signature
-from jtqd.drivers.nmt import STATES
+from jtqd.drivers.nmt import OPERATIONAL, START, STATES
 from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoQueue
 
 NOT_WATCHED, WAITING, ACTIVE, LOST = 0, 1, 2, 3
@@ -313,6 +313,9 @@ class NodeCare:
         self._check_turn = 0
         self.changed: dict[int, str] = {}
 
+    unchecked: frozenset[int] = frozenset()
+    """Nodes with an identity that nobody has checked: none, after a boot."""
+
     def is_booting(self, now_s: float) -> bool:
         """Return whether a boot is running or has just ended, so that NMT commands may belong to it."""
         return bool(self._returning.busy) or now_s < self._boot_ended
@@ -323,7 +326,10 @@ class NodeCare:
         if node != self._returning.busy:
             self._out += [(node, request) for request in self._queues[node].on_reply(data, now_s)]
 
-    def on_foreign_request(self, node: int, now_s: float) -> None:
+    def on_command(self, number: int, node: int) -> None:
+        """Take an NMT command of another node: its effect shows in the heartbeats."""
+
+    def on_foreign_request(self, node: int, data: bytes, now_s: float) -> None:
         """Take a frame 600h + node that jtqd did not send."""
         self._others_until[node] = now_s + _OTHERS_S
 
@@ -428,3 +434,112 @@ class NodeCare:
 
 def _ignore(_value: bytes | None, _refusal: int | None) -> None:
     """Take the result of a request of which only the answer as such matters."""
+
+
+# As a guest -----------------------------------------------------------------------------------------------------------
+
+_IDENTITY = 0x1018
+
+
+class HeardNodes(NodeCare):
+    """The nodes of another master: what is heard of them, and no request.
+
+    A node that left operational, or sent its boot-up message, is used again once it is operational. One of which a master
+    writes or reads another value than its PDOs are decoded with is not used until that value is back. `unchecked`: nodes
+    whose identity (1018h) no master has read yet.
+
+    report: of `jtqd.drivers.boot.known_nodes`; the other arguments are those of `NodeCare`.
+    """
+
+    def __init__(self, report: Mapping[str, Any], *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._expected: dict[int, dict[tuple[int, int], Check]] = {}
+        self._unread: dict[int, set[tuple[int, int]]] = {node: set() for node in report.get("unchecked", ())}
+        for number, each in report["nodes"].items():
+            identity = report["identities"].get(number, {})
+            checks = [Check(_IDENTITY, int(sub), _ALL, value) for sub, value in identity.items()]
+            checks += [check for check in checks_of(each) if check.expected is not None]
+            self._expected[int(number)] = {(check.index, check.subindex): check for check in checks}
+        self._asked: dict[int, tuple[tuple[int, int], int | None]] = {}
+        self._differs: dict[int, dict[tuple[int, int], str]] = {node: {} for node in self._expected}
+        self._runs: dict[int, bool] = {}
+        """By the last NMT command; a node without one may be operational."""
+        self._waiting: set[int] = set()
+        for node in self._unread:
+            self._uncheck(node)
+
+    def _uncheck(self, node: int) -> None:
+        """It may be another device than before."""
+        self._unread[node] = {key for key in self._expected[node] if key[0] == _IDENTITY} or {(_IDENTITY, 0)}
+        self._note_identity(node)
+
+    def _note_identity(self, node: int) -> None:
+        self.unchecked = frozenset(each for each, unread in self._unread.items() if unread)
+        self._reader.note_checked(node, node not in self.unchecked)
+
+    def is_booting(self, now_s: float) -> bool:
+        """Return True: NMT commands are those of the master."""
+        return True
+
+    def on_command(self, number: int, node: int) -> None:
+        """Take an NMT command."""
+        self._runs |= dict.fromkeys([node] if node else self._expected, number == START)
+
+    def on_foreign_request(self, node: int, data: bytes, now_s: float) -> None:
+        """Take a frame 600h + node of its master: an upload, or a download with its value."""
+        if len(data) == 8 and data[0] >> 5 in (1, 2):
+            # what comes in segments is not followed: it counts as another value
+            value = int.from_bytes(data[4 : 8 - (data[0] >> 2 & 3)], "little") if data[0] & 2 else _ALL
+            self._asked[node] = (data[1] | data[2] << 8, data[3]), value if data[0] >> 5 == 1 else None
+
+    def on_reply(self, node: int, data: bytes, now_s: float) -> None:
+        """Take a frame 580h + node: the value of the object that its master has read, or written."""
+        key, value = self._asked.pop(node, ((0, 0), None))
+        check = self._expected.get(node, {}).get(key)
+        if check is None or len(data) != 8 or (data[1] | data[2] << 8, data[3]) != key:
+            return
+        if data[0] >> 5 == 2 and data[0] & 2:
+            value = int.from_bytes(data[4 : 8 - (data[0] >> 2 & 3)], "little")
+        elif data[0] >> 5 != 3:
+            return
+        if value is not None and value & check.mask != check.expected:
+            found = f"expected {check.text(check.expected or 0)}, found {check.text(value)}"
+            self._differs[node][key] = f"({key[0]:04X}h:{key[1]}: {found})"
+            return
+        self._differs[node].pop(key, None)
+        if node in self.unchecked and key in self._unread[node]:
+            self._unread[node].discard(key)
+            self._note_identity(node)
+
+    def configured(self, node: int, report: dict[str, Any], now_s: float) -> None:
+        """Take a node of the start: its heartbeat is watched from the first one on."""
+
+    def restarted(self, node: int) -> None:
+        """Take a boot-up message: what was written before is gone."""
+        if node not in self._differs:
+            return  # of a sensor that nobody has described
+        self._differs[node].clear()
+        self._runs.pop(node, None)
+        self._waiting.add(node)
+        if node in self._unread:
+            self._uncheck(node)
+
+    def turn(self, view: View, now_s: float) -> list[tuple[int, bytes]]:
+        """Doubt the nodes that were changed, use again those that are as expected; return no request."""
+        for node, differs in self._differs.items():
+            state = view.node_states[node]
+            if state and self._heartbeats.state(node) == NOT_WATCHED:
+                self._heartbeats.watch(node, now_s)
+            if differs:
+                if node not in self.changed:
+                    self._reader.note_doubt(node)
+                    self._waiting.add(node)
+                self.changed[node] = next(iter(differs.values()))
+                continue
+            self.changed.pop(node, None)
+            if node in view.unconfigured and self._runs.get(node, state == OPERATIONAL):
+                self._reader.note_configured(node, view.restarts[node])
+                if node in self._waiting:
+                    self._waiting.discard(node)
+                    self._log("boot", node, f"node {node} is operational and used again")
+        return []

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jtqd.daemon.bus.boot import ReturningNodes
-from jtqd.daemon.bus.nodes import NodeCare, NodeEvent, NodeWatch
+from jtqd.daemon.bus.nodes import HeardNodes, NodeCare, NodeEvent, NodeWatch
 from jtqd.daemon.bus.own_node import OwnErrors, OwnNode
-from jtqd.daemon.config import Config
+from jtqd.daemon.config import LISTENER, MASTER, Config
 from jtqd.daemon.shared.conditions import THE_BUS, Conditions, Subject
 from jtqd.daemon.shared.events import RateLimit
 from jtqd.daemon.shared.runtime_dir import write_whole
@@ -252,7 +252,8 @@ class BusService:
         self.heartbeats = NodeWatch(
             tuple(nodes),
             (config.node_id, COMMANDER_NODE),
-            config.heartbeat_ms * 1e-3,
+            # the rate that another master has given the nodes is not known
+            config.heartbeat_ms * 1e-3 if config.role == MASTER else 0.0,
             config.heartbeat_timeout_ms * 1e-3,
         )
         self.errors = OwnErrors(store)
@@ -261,11 +262,16 @@ class BusService:
         self.own.bus, self.own.emergencies = self.bus.values, self._emergency
         self.own.nodes = lambda node: self.care.state(node, self._view)
         self.returning = returning
-        self.care = NodeCare(sdo_timeouts_s(config), reader, returning, self.heartbeats, log)
+        self.care: NodeCare | HeardNodes = (
+            NodeCare(sdo_timeouts_s(config), reader, returning, self.heartbeats, log)
+            if config.role == MASTER
+            else HeardNodes(report, sdo_timeouts_s(config), reader, returning, self.heartbeats, log)
+        )
         self._limit = RateLimit()
         self._report_due = 0.0
         self._view = reader.read()
-        self._own_cob_ids = {base + config.node_id for base in _OWN_BASES}
+        bases = () if config.role == LISTENER else _OWN_BASES
+        self._own_cob_ids = {base + config.node_id for base in bases}
         self._conflicts = self._view.counters["cob_id_conflicts"]
         self._conflict_until_s: dict[int, float] = {}
         self.foreign_nmt = 0
@@ -304,7 +310,9 @@ class BusService:
         with suppress(BusDown):
             while count := self.socket.receive():
                 for can_id, data in self._frames(count):
-                    if can_id in self._own_cob_ids:
+                    if self._config.role != MASTER:  # its master may have written to nodes since
+                        self._on_frame(can_id, data, now_s)
+                    elif can_id in self._own_cob_ids:
                         self._conflict_until_s[can_id] = now_s + _CONFLICT_S
                     elif 0x080 < can_id <= 0x0FF:
                         self._on_emergency(can_id - 0x080, data, now_s)
@@ -315,8 +323,10 @@ class BusService:
             for note in node.get("notes", ()):
                 self._log("boot", int(number), f"node {number}: {note}")
         for number, error in self._first.get("absent", {}).items():
-            text = f"{error['message']}: it is optional; jtqd continues, and configures it when it appears"
-            self._log("boot", int(number), text)
+            later = ", and configures it when it appears" if self._config.role == MASTER else " without it"
+            self._log("boot", int(number), f"{error['message']}: it is optional; jtqd continues{later}")
+        for note in self._first.get("notes", ()):
+            self._log("boot", 0, note)
 
     def turn(self, view: View, now_s: float) -> None:
         """Process received frames and send the due ones. Raises BusGone."""
@@ -337,10 +347,11 @@ class BusService:
         for node, subject in self._subjects.items():
             text = self.care.changed.get(node)
             self._conditions.update("node_changed", subject, text is not None, now_s, text or "")
+            self._conditions.update("node_unchecked", subject, node in self.care.unchecked, now_s)
         with suppress(BusDown):
             for node, request in requests:
                 self.socket.send(pack(REQUEST_ID + node, request))
-            if self.bus.state not in (BUS_OFF, DOWN):
+            if self.bus.state not in (BUS_OFF, DOWN) and self._may_send(view):
                 message = self.errors.tick(now_s)
                 if message is not None:
                     self.socket.send(pack(0x080 + self._config.node_id, message))
@@ -351,6 +362,11 @@ class BusService:
                 with suppress(OSError):  # nothing depends on the file
                     write_whole(self._directory / FILE, text)
                     self._written = text
+
+    def _may_send(self, view: View) -> bool:
+        """Whether EMCY and SDO answers may be sent: as a guest not after NMT stop, as a listener never."""
+        stopped = view.node_states[self._config.node_id] == nmt.STOPPED
+        return self._config.role == MASTER or not (self._config.role == LISTENER or stopped)
 
     def _observe_conflicts(self, view: View, now_s: float) -> None:
         """Report COB-IDs of jtqd that others send with: those of the loop, which counts them, and those of this socket."""
@@ -392,7 +408,7 @@ class BusService:
         elif can_id >= nmt.HEARTBEAT_BASE:
             self._node_events(self.heartbeats.receive(can_id - nmt.HEARTBEAT_BASE, data, now_s), now_s)
         elif can_id >= REQUEST_ID:
-            self.care.on_foreign_request(can_id - REQUEST_ID, now_s)
+            self.care.on_foreign_request(can_id - REQUEST_ID, data, now_s)
         elif can_id >= RESPONSE_ID:
             self.care.on_reply(can_id - RESPONSE_ID, data, now_s)
         elif can_id == 0x000:
@@ -401,7 +417,7 @@ class BusService:
             self._on_emergency(can_id - 0x080, data, now_s)
 
     def _on_request(self, data: bytes) -> None:
-        answer = self.own.answer(data)
+        answer = self.own.answer(data) if self._may_send(self._view) else None
         if answer is not None:
             with suppress(BusDown):
                 self.socket.send(pack(RESPONSE_ID + self._config.node_id, answer))
@@ -418,7 +434,9 @@ class BusService:
             self._conditions.update("node_error", subject, error, now_s, describe(last))
 
     def _on_nmt(self, data: bytes, now_s: float) -> None:
-        """Report an NMT command that is not of jtqd's own boots."""
+        """Report an NMT command that is not of jtqd's own boots, or the master's."""
+        if len(data) == 2:
+            self.care.on_command(*data)
         if self.care.is_booting(now_s):
             return
         self.foreign_nmt += 1

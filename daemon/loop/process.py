@@ -19,12 +19,12 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from jtqd.daemon.config import Config, JointConfig, as_booted, load_config
+from jtqd.daemon.config import GUEST, LISTENER, MASTER, Config, JointConfig, as_booted, load_config
 from jtqd.daemon.core.cycle import RUN_ENDED, SLOT_PASSED, Cycle, frame_counts
 from jtqd.daemon.core.input_pdos import input_pdos, joint_inputs, joint_temperatures
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import contacts_of
-from jtqd.daemon.core.schedule import Grid
+from jtqd.daemon.core.schedule import Grid, SyncGrid
 from jtqd.daemon.core.status import safety_of
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.shared.cycle_record import Ring, layout_of
@@ -175,8 +175,14 @@ def loop_filters(config: Config) -> list[CanFilter]:
     pdos = [*(pdo.cob_id for pdo in inputs), *(each.cob_id for each in joint_temperatures(config))]
     nodes = dict.fromkeys(pdo.node_id for pdo in inputs)
     others = (SYNC_COB_ID, *pdos, *(HEARTBEAT_BASE + node for node in nodes))
-    own = set(loop_cob_ids(config.node_id)) - set(pdos)
-    return [*map(any_format, others), *map(exact, sorted(own))]
+    own = set(own_cob_ids(config)) - set(pdos)
+    commands = [exact(0x000)] if config.role == GUEST else []
+    return [*map(any_format, others), *map(exact, sorted(own)), *commands]
+
+
+def own_cob_ids(config: Config) -> tuple[int, ...]:
+    """Return the COB-IDs that only the loop may use; none of a listener, which may stand beside another jtqd."""
+    return () if config.role == LISTENER else loop_cob_ids(config.node_id)
 
 
 def warm_up(estimators: list[Estimator]) -> None:
@@ -228,14 +234,16 @@ def build_cycle(
     shadows: Sequence[Sequence[Estimator]] = (),
 ) -> tuple[Cycle, Grid]:
     """Build cycle and grid from configuration and boot report; shadows: of each joint, empty without."""
-    grid = Grid(0, config.period_ns)
+    grid = Grid(0, config.period_ns) if config.role == MASTER else SyncGrid(config.period_ns)
     snapshot = Snapshot(
         Path(request["snapshot"]),
         config.period_ns * 1e-9,
         float(report.get("worst_load", request["worst_load"])),
         len(config.joints),
     )
-    intake = Intake(input_pdos(config), joint_temperatures(config), loop_cob_ids(config.node_id))
+    for node in report.get("unchecked", ()):
+        snapshot.unchecked[node] = 1
+    intake = Intake(input_pdos(config), joint_temperatures(config), own_cob_ids(config))
     for node in {pdo.node_id for pdo in intake.pdos} - {int(node) for node in report["nodes"]}:
         intake.leave_out(node)
     cycle = Cycle(
@@ -249,7 +257,9 @@ def build_cycle(
         counter_overflow=config.counter_overflow,
         wait_ns=config.input_wait_ns,
         deadline_ns=config.input_deadline_ns,
-        heartbeat_cycles=max(1, config.heartbeat_ms * 1_000_000 // config.period_ns),
+        heartbeat_cycles=0
+        if config.role == LISTENER
+        else max(1, config.heartbeat_ms * 1_000_000 // config.period_ns),
         grid=grid,
         contacts=contacts_of(config),
         shadows=shadows,
@@ -261,7 +271,7 @@ def build_estimators(
     request: dict[str, Any], notes: list[str] | None = None
 ) -> tuple[Config, list[Estimator]]:
     """Load the configuration and warm up the estimators of all joints. Raises ConfigError, NetworkError."""
-    config = load_config(Path(request["config"]) if request["config"] else None)
+    config = load_config(Path(request["config"]) if request["config"] else None, request.get("role"))
     if config.files_sha256 != request["config_sha256"]:
         raise ConfigError(f"{config.path}: it or one of its joint files was changed during reading")
     estimators = [
@@ -295,9 +305,13 @@ def serve(request: dict[str, Any]) -> int:
     grid.slot_ns = time.monotonic_ns() + 2 * config.period_ns
     duration_s = request.get("duration_s")
     end_ns = None if duration_s is None else grid.slot_ns + round(duration_s * 1e9)
+    if config.role == GUEST:
+        cycle.reset_communication()
     error = None
     try:
-        run(cycle, grid, lambda: stop.requested, end_ns, duties)
+        # A guest hears at any time that a node is changed: it looks after each cycle.
+        slots = SLOTS if config.role == MASTER else 1
+        run(cycle, grid, lambda: stop.requested, end_ns, duties, slots=slots)
         cycle.leave()
     except BusGone as gone:
         error = str(gone)

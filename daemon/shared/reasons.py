@@ -37,7 +37,7 @@ _HELD = "waiting for enough consecutive good cycles"
 _ON_THE_BUS = (
     ("bus_errors", "the bus is down"),
     ("foreign_sync", "another SYNC producer is on the bus"),
-    ("sync_errors", "the own SYNC waits in the transmit queue"),
+    ("sync_errors", "SYNC waits in the transmit queue, or is irregular"),
 )
 """Counters whose rise makes every input of the bus doubtful, and what that means."""
 _ON_THE_PDO = (

@@ -166,7 +166,7 @@ LATE_BINS, LATE_BIN_NS = 250, 4_000
 MAX_INPUTS = 20
 """Four TPDOs of each of four drives and two sensor channels are eighteen."""
 
-_MAGIC = 0x4A54_5144_5354_410D  # "JTQDSTA", layout 13
+_MAGIC = 0x4A54_5144_5354_410E  # "JTQDSTA", layout 14
 _HEAD = struct.Struct("<QQddQ")
 """Magic number, process, period [s], worst load, number of joints."""
 JOINT = struct.Struct("<6dHBBHH4d")
@@ -213,6 +213,9 @@ class _Views:
             "Q", MAX_NODE
         )  # s: the `restarts` after which it was last configured
         self.doubts = self._next("B", MAX_NODE)  # s: how often it was found with a changed configuration
+        self.unchecked = self._next(
+            "B", MAX_NODE
+        )  # s: 1: as a guest, nobody has checked its identity or layout
         self.learned = self._next("B", MOST_JOINTS * LEARNED.size)
         # guarded as `estimate` is, and per joint and method errors as in `errors`
         self.shadows = self._next("B", MOST_JOINTS * SHADOW.size)
@@ -365,6 +368,11 @@ class SnapshotReader:
         """Report that a node has a changed configuration: the loop does not use it until it is configured again."""
         doubts = self._views.doubts
         doubts[node_id] = (doubts[node_id] + 1) % 256
+        self._request(2)
+
+    def note_checked(self, node_id: int, checked: bool) -> None:
+        """Report whether the identity of a node has been checked: else its status is at most degraded."""
+        self._views.unchecked[node_id] = not checked
         self._request(2)
 
     def note_alive(self) -> None:

@@ -12,12 +12,13 @@ from functools import partial
 from math import hypot, inf, isfinite
 
 from jtqd.daemon.bus.service import node_subjects
-from jtqd.daemon.config import Config
+from jtqd.daemon.config import GUEST, MASTER, Config
 from jtqd.daemon.core.input_pdos import input_pdos, joint_temperatures, names_of_inputs, sensor_index
 from jtqd.daemon.shared.conditions import (
     DEVIATION_S,
     DEVIATION_SIGMAS,
     SHOWN_BY_COUNTERS,
+    THE_BUS,
     THE_LOOP,
     THE_RECORDER,
     Conditions,
@@ -46,6 +47,8 @@ COUNTER_QUIET_S = 1.0
 """A condition that shows by a counter has ended when the counter has stood still for so long."""
 _STOPPED_S = 0.25
 """The snapshot is written every 8th cycle."""
+_SILENT_S = 0.1
+"""Without a SYNC of another master, beside three periods."""
 TIMEOUT_CYCLES = 20
 """Cycles in a row without a valid frame of a PDO: timeout (EMCY 8250h)."""
 LENGTH_S = 1.0
@@ -190,6 +193,7 @@ class Health:
         self._pdos = PdoWatch(pdo_subjects(config), conditions)
         self._counters: dict[str, tuple[int, float]] = {}
         self._cycle, self._advanced_s = -1, -inf
+        self._guest, self._sync_s = None if config.role == MASTER else config, 0.0
 
     def observe(
         self, view: View, now_s: float, *, absent: Collection[int] = (), cycles_lost: int = 0
@@ -206,8 +210,12 @@ class Health:
         text = f"{_STOPPED_S:g} s"
         self._conditions.update("loop_stopped", THE_LOOP, stopped, now_s, text, since_s=since_s)
         self._pdos.observe(view.inputs, absent, now_s)
+        if self._guest is not None:
+            self._observe_master(self._guest, view, now_s)
         for counter, (name, subject) in _COUNTED.items():
-            self._observe_counter(name, subject, view.counters[counter], now_s)
+            if self._guest is not None and name == "sync_late":
+                name, text = "sync_irregular", f"{1e6 * view.period_s:g} us"  # noqa: PLW2901
+            self._observe_counter(name, subject, view.counters[counter], now_s, text)
         self._observe_counter("cycles_lost", THE_RECORDER, cycles_lost, now_s, str(cycles_lost))
         for joint, seen, zeros in zip(self._joints, view.joints, view.zeros[: len(view.joints)], strict=True):
             self._observe_inputs(joint, seen, view, now_s)
@@ -220,6 +228,16 @@ class Health:
                     self._conditions.update("deviation", joint.subject, far, now_s, text)
         for node, subject in self._nodes.items():
             self._observe_node(node, subject, view, absent, now_s)
+
+    def _observe_master(self, config: Config, view: View, now_s: float) -> None:
+        """Observe the SYNC of another master, and the NMT state that it gives jtqd."""
+        self._sync_s = view.sync_monotonic_ns * 1e-9 or self._sync_s or now_s
+        silent = now_s - self._sync_s > _SILENT_S + 3e-9 * config.period_ns
+        text = f"for {_SILENT_S:g} s" if view.sync_monotonic_ns else "since the start"
+        self._conditions.update("sync_lost", THE_BUS, silent, now_s, text)
+        state = view.node_states[config.node_id]
+        idle = config.role == GUEST and state in nmt.NOT_OPERATIONAL
+        self._conditions.update("not_operational", THE_BUS, idle, now_s, nmt.STATES.get(state, ""))
 
     def _observe_inputs(self, joint: _Joint, seen: JointView, view: View, now_s: float) -> None:
         conditions, subject = self._conditions, joint.subject

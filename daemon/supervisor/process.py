@@ -21,7 +21,7 @@ from typing import Any
 
 from jtqd.daemon.bus.boot import ReturningNodes, boot_request, bus_load_of, gear_ratio_error, own_eds
 from jtqd.daemon.bus.service import BusService, nodes_of, sdo_timeouts_s, service_filters
-from jtqd.daemon.config import Config, Ros2Settings, as_booted
+from jtqd.daemon.config import MASTER, Config, Ros2Settings, as_booted
 from jtqd.daemon.core.input_pdos import input_pdos, names_of_inputs, sensor_index
 from jtqd.daemon.live import Address, LiveView
 from jtqd.daemon.loop.realtime import stolen_s
@@ -246,6 +246,8 @@ class Supervisor:
         self._send: Callable[[bytes], bool] | None = None
         """Set as long as nodes that we have started are on the bus."""
         self._load = checked_load(config)
+        if bus == "sim" and config.role != MASTER:
+            raise SupervisorError(f"--bus sim: its bench has no master, which role {config.role} needs")
         self._log_directory = log_directory(record)
         self._sides: list[LiveView | Ros2Publisher] = [] if live is None else [LiveView(self._child, live)]
         self._sides += [Ros2Publisher(self._child, config.ros2 or Ros2Settings())] if ros2 else []
@@ -314,7 +316,8 @@ class Supervisor:
         report = boot_nodes(self._config, self._bus, boot, self._stopped)
         if report is None:
             return None
-        self._send = socket.send  # from here on the nodes are ours to put back
+        if self._config.role == MASTER:
+            self._send = socket.send  # from here on the nodes are ours to put back
         for number, booted in report["nodes"].items():
             wrong = gear_ratio_error(self._config, int(number), booted.get("gear_ratio"))
             if wrong is not None:
@@ -411,6 +414,7 @@ class Supervisor:
     def _loop_request(self) -> dict[str, Any]:
         return {
             "config": str(self._config_path) if self._config_path else None,
+            "role": self._config.role,
             "config_sha256": self._config.files_sha256,
             "bus": self._bus,
             "ring": str(self._ring),
@@ -423,7 +427,8 @@ class Supervisor:
 
     def _watch(self, loop: Child, reader: SnapshotReader, bench: Child | None) -> dict[str, Any]:
         """Serve table, SDO requests and recorder until the loop ends; return the loop's last answer."""
-        title = f"jtqd on {self._instance}, node {self._config.node_id:02X}h, {self._config.estimator.method}"
+        role = "" if self._config.role == MASTER else f" as {self._config.role}"
+        title = f"jtqd on {self._instance}{role}, node {self._config.node_id:02X}h, {self._config.estimator.method}"
         stopping, node = 0.0, self._bus_service.own
         watched = self._config.contact is not None
         with Display(reader, self._config.bitrate, title, self._log, contacts=watched) as display:

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from jtqd.daemon.config import Config
+from jtqd.daemon.config import MASTER, Config
 from jtqd.daemon.shared.conditions import CATALOGUE, Condition, Conditions
 from jtqd.daemon.shared.counters import RECORDER_LOST, TABLE
 from jtqd.daemon.shared.events import OperatorLog, Priority
@@ -188,6 +188,8 @@ class Service:
 
     def _estimating(self, view: View) -> bool:
         """Return whether the loop publishes and every mandatory joint has inputs and a settled estimator."""
+        if self._config.role != MASTER:  # its master may be started later
+            return True
         joints = zip(self._config.joints, view.joints, strict=True)
         waits = any(configured.mandatory and joint.status in _NOT_READY for configured, joint in joints)
         return view.counters["published"] > 0 and not waits

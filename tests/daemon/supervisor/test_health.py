@@ -50,7 +50,7 @@ IN_TIME = "281h drive 1 TPDO2 not received in time"
         ({"late_frames": 9}, f"{IN_TIME} (late frames on the bus)"),
         ({"rejected_frames": 9}, f"{IN_TIME} (frames of a wrong format on the bus)"),
         ({"foreign_sync": 1}, "another SYNC producer is on the bus"),
-        ({"sync_errors": 1}, "the own SYNC waits in the transmit queue"),
+        ({"sync_errors": 1}, "SYNC waits in the transmit queue, or is irregular"),
         ({"bus_errors": 1, "late_frames": 3}, "the bus is down"),
         ({"states": {1: 4}}, "node 1 is stopped"),
         ({"states": {1: 127}, "bus_errors": 1}, "node 1 is pre-operational"),
