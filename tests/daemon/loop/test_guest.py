@@ -193,6 +193,11 @@ def test_no_wrong_torque_and_told_at_once(tmp_path: Path, clock: ExactTime, kind
     # Of nodes that restarted nothing is used until the supervisor has seen to it.
     assert bool(later) == (kind in {"pause", "jitter", "late guest"})
     assert {struct.unpack_from("<I", data)[0] - OWN for _, data in wire.sent} <= {0x180, 0x700}
+    if kind not in {"period", "second master"}:
+        slots = [
+            (header.cycle, round((header.sync_realtime_ns - begin_ns) / PERIOD_NS)) for header, _ in found
+        ]
+        assert {cycle - slot for cycle, slot in slots} == {slots[0][0]}, "the index follows time"
     sent = wire.own_frames(0x180)
     published = [header for header, _ in found if header.flags & FLAG_PUBLISHED]
     assert len(sent) == len(published)
@@ -202,6 +207,29 @@ def test_no_wrong_torque_and_told_at_once(tmp_path: Path, clock: ExactTime, kind
     ]
     assert sum(in_time) >= 0.999 * len(in_time)
     assert kind != "late guest" or loop.cycle.grid.missed <= 6
+
+
+@pytest.mark.parametrize("command", [STOP, PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION])
+@pytest.mark.parametrize("node", [0, 1])
+def test_a_node_that_its_master_stops_is_not_used(
+    tmp_path: Path, clock: ExactTime, command: int, node: int
+) -> None:
+    """Its frames may be those of another mapping: none of them is an input from the command on."""
+    wire, begin_ns = Wire(clock), clock.now_ns + PERIOD_NS
+    wire.put(clock.now_ns, nmt(START))
+    wire.put(begin_ns + 100 * PERIOD_NS - 1000, nmt(command, node))
+    loop = Loop(tmp_path, clock, wire.follow(regular(begin_ns))).run(begin_ns + 200 * PERIOD_NS)
+    records = loop.read()
+    used = [
+        [
+            not isnan(JointRecord(*JOINT.unpack_from(each, HEADER.size + n * JOINT.size)).dt_s)
+            for each in records
+        ]
+        for n in range(2)
+    ]
+    assert sum(used[0][:100]) > 90
+    assert not any(used[0][100:])
+    assert any(used[1][100:]) == (node == 1)
 
 
 def test_silence_shows_where_the_loop_is_asked(tmp_path: Path, clock: ExactTime) -> None:
