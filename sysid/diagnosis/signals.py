@@ -188,6 +188,7 @@ class JointSignals:
     noise: Mapping[str, float] = field(default_factory=dict)  # of current and torque as recorded, usual
     sensor_temperature_c: FloatArray | None = None  # None: that of this joint (`with_one_sensor`)
     visible: Smoother = _ALL_VISIBLE  # what it leaves of both balances is judged, and of their regressors
+    known_motion: Smoother = _ALL_VISIBLE  # what the noise of the motion leaves of them
     believed: list[Joint] = field(default_factory=list)  # with the values found: effects are relative to it
     torque_hz: float = math.inf  # torques in regressors are known below it
     coarse: str = ""  # what the resolution of the recording costs, "" for nothing
@@ -427,7 +428,7 @@ def joint_signals(  # noqa: PLR0917
         motion = motion.below(COMPUTED_HZ, step, "computed")
     both = raw.two_encoders(joint.gear_ratio)
     shown = known_below_hz(sensor, step)
-    known = like.torque_hz if like else max(COMPUTED_HZ, shown)
+    known, known_motion = like.torque_hz if like else max(COMPUTED_HZ, shown), motion.visible
     if like is None and both and (static := max(COMPUTED_HZ, _STATIC * _swings_hz(joint))) < shown:
         motion = motion.below(static, step, "quicker than the spring follows")
     velocity = motion.visible(motion.speed) / joint.gear_ratio
@@ -499,6 +500,7 @@ def joint_signals(  # noqa: PLR0917
             for name, x in (("current_a", columns.current_a), ("torque_nm", sensor))
         },
         visible=motion.visible,
+        known_motion=known_motion,
         torque_hz=known,
         coarse=motion.coarse,
     )

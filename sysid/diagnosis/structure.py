@@ -47,6 +47,8 @@ MOST: Final = 3
 """Views that are taken out."""
 ORDERS: Final = np.arange(0.7, 10.0, 0.04)
 """Per motor revolution, where lines of a residual are looked for; what is slower is a condition of the angle."""
+QUICK_ORDERS: Final = np.arange(0.75, 100.0, 0.25)
+"""The same of what is quicker than a balance is judged."""
 _HZ: Final = (2.0, 40.0)
 """Where vibrations of frames and sensors are looked for."""
 HZ_STEP: Final = 0.25 / BLOCK_S
@@ -297,11 +299,11 @@ def _signs(flips: int, blocks: int) -> FloatArray:
 # Lines.
 
 
-def lines(balance: Balance, parts: Sequence[FloatArray]) -> list[View]:
-    """Return the lines that stand out of a channel's spectra."""
+def lines(balance: Balance, parts: Sequence[FloatArray], orders: FloatArray = ORDERS) -> list[View]:
+    """Return the lines that stand out of a channel's spectra; orders: as of `order_lines`."""
     runs, step_s, residual = balance.runs, balance.step_s, {balance.channel: parts}
     out = []
-    for found in (*order_lines(runs, residual, step_s), *frequency_lines(runs, residual, step_s)):
+    for found in (*order_lines(runs, residual, step_s, orders), *frequency_lines(runs, residual, step_s)):
         if found.ratio > STRONG_LINE and 0.5 * found.amplitude_nm**2 > balance.least_nm2:
             line = sharpened(found, runs, parts, step_s)
             energy = 0.5 * line.amplitude_nm**2
@@ -332,7 +334,7 @@ def order_lines(
     step_s: float,
     orders: FloatArray = ORDERS,
 ) -> list[Line]:
-    """Return lines that stand out of the order spectrum of a channel, strongest first; orders: where to look, rising.
+    """Return lines that stand out of the order spectrum of a channel, strongest first; orders: where to look, evenly.
 
     The residual's Fourier sum over the motor's angle, in stretches of 2 s in which the motor turns far enough: a line at an
     order stays one whatever the speed.
@@ -380,10 +382,15 @@ def _order_power(
             theta, y = angle[good], x[good]
             if len(good) < length // 2 or np.ptp(theta) < 2.0 * np.pi * _FEWEST_TURNS:
                 continue
-            y = ((y - y.mean()) / len(y)).astype(np.float32)
             # the angle within the stretch: single precision is enough for a thousand turns
-            turn = np.outer(orders, theta - theta[0]).astype(np.float32)
-            power += (np.cos(turn) @ y) ** 2 + (np.sin(turn) @ y) ** 2
+            wave, turn = (
+                np.exp(1j * order * (theta - theta[0])).astype(np.complex64)
+                for order in (orders[0], orders[1] - orders[0])
+            )
+            wave *= (y - y.mean()) / len(y)
+            for k in range(len(orders)):
+                power[k] += abs(np.sum(wave)) ** 2
+                wave *= turn
             weight += 1
     return power / max(weight, 1), weight
 

@@ -7,7 +7,7 @@ remains, with energy and reasons, and where. Where nothing that remains matters,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from typing import Final
@@ -15,16 +15,17 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects.effect import TORSION
+from jtqd.estimator.effects.effect import MOTOR, TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.entries import set_state
 from jtqd.sysid.diagnosis.findings import Gap, Place, Present, Trace, shows_at
-from jtqd.sysid.diagnosis.regressors import LINE, Index, binned, contribution
+from jtqd.sysid.diagnosis.regressors import LINE, Index, RunData, binned, contribution, samples_in
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
-from jtqd.sysid.diagnosis.structure import AXES, Balance, View, events, pursue
+from jtqd.sysid.diagnosis.structure import AXES, QUICK_ORDERS, Balance, View, events, lines, pursue
 
 _MOST_OF_THE_TIME: Final = 0.1
 """What takes more of the time than this is no event but a condition."""
+_APART: Final = 0.25  # order, or Hz, within which two lines are one
 _TRACE_POINTS: Final = 4000
 """Samples of a run in a picture."""
 QUADRANT_NAMES: Final = ("v+ load+", "v+ load-", "v- load+", "v- load-")
@@ -36,26 +37,20 @@ Parts = list[FloatArray]
 """A residual [run][n], NaN where it is not valid."""
 
 
-def contributions(dataset: Dataset, present: Present) -> list[dict[Channel, FloatArray]]:
-    """Return what an effect contributes to each channel, per run, binned [n], Nm."""
-    out = []
-    for run, data in zip(dataset.signals, dataset.runs, strict=True):
-        found = {}
-        for s in run:
-            if shows_at(present.joint, s.number):
-                for balance, value in contribution(present.effect, present.values, s).items():
-                    found[Channel(s.number, balance)] = binned(s.visible(value), data.samples)
-        out.append(found)
-    return out
+Quick = tuple[Balance, Parts, float]
+"""A balance in steps as recorded, its residual, and the frequency [Hz] below which it is judged."""
 
 
 @dataclass(frozen=True)
 class Remaining:
-    """What effects leave of the runs: residual per channel and run [n]; own: what each run has of its own [r, q]."""
+    """What effects leave of the runs: residual per channel and run [n]; own: what each run has of its own [r, q]; quick: of
+    channels that are judged below a frequency, what is quicker, too.
+    """
 
     dataset: Dataset
     residual: Mapping[Channel, Parts]
     own: FloatArray
+    quick: Mapping[Channel, Quick] = field(default_factory=dict)
 
     @cached_property
     def run_to_run(self) -> FloatArray:
@@ -97,11 +92,33 @@ def remaining(dataset: Dataset, present: Sequence[Present], own: FloatArray) -> 
     for s in (joint for run in dataset.signals for joint in run):
         set_state(s, present)
     residual = {c: [d.residual for d in dataset.of(c)] for c in dataset.runs[0].channels}
-    for p in present:
-        for r, found in enumerate(contributions(dataset, p)):
-            for channel, value in found.items():
-                residual[channel][r] = residual[channel][r] - value
-    return Remaining(dataset, residual, own[list(dataset.recordings)])
+    for r, (run, data) in enumerate(zip(dataset.signals, dataset.runs, strict=True)):
+        for p, s in ((p, s) for p in present for s in run if shows_at(p.joint, s.number)):
+            for balance, value in contribution(p.effect, p.values, s).items():
+                of = residual[Channel(s.number, balance)]
+                of[r] = of[r] - binned(s.visible(value), data.samples)
+    return Remaining(dataset, residual, own[list(dataset.recordings)], _quick(dataset, present))
+
+
+def _quick(dataset: Dataset, present: Sequence[Present]) -> dict[Channel, Quick]:
+    """Return what effects leave of channels that are judged below a frequency which is not the noise's, unfiltered."""
+    every = [s for run in dataset.signals for s in run]
+    step, out = max(s.step_s for s in every), dict[Channel, Quick]()
+    for s in (s for s in every if s.visible is not s.known_motion):
+        samples, rated = samples_in(step, [s]), s.joint.rated_torque_nm
+        mine = [contribution(p.effect, p.values, s) for p in present if shows_at(p.joint, s.number)]
+        axes = {"time": s.state.time_s, "motor_angle": s.state.motor_position_rad}
+        seen = {s.number: {name: binned(x, samples) for name, x in axes.items()}}
+        for balance, known in ((MOTOR, s.motor_nm), (TORSION, s.torsion_nm)):
+            if known is not None:
+                channel = Channel(s.number, balance)
+                runs, parts = [RunData(s.run, seen[s.number]["time"], {}, seen, samples)], list[FloatArray]()
+                if channel in out:
+                    runs, parts = [*out[channel][0].runs, *runs], out[channel][1]
+                whole = s.known_motion(known - sum(found.get(balance, 0.0) for found in mine))
+                parts.append(binned(np.where(s.usable(balance), whole, np.nan), samples))
+                out[channel] = Balance(runs, channel, step, rated), parts, s.visible.slowest_hz
+    return out
 
 
 @dataclass(frozen=True)
@@ -146,6 +163,16 @@ def unexplained_residual(left: Remaining) -> Unexplained:
     """Return the unexplained residual when causes and run-to-run variation are taken out."""
     balances = _balances(left.dataset, left.less_variation)
     found = {c: pursue(balances[c], x) for c, x in left.less_variation.items()}
+    every = {c: x for c, x in left.quick.items() if len(x[1]) == len(left.dataset.runs)}
+    for c, (fine, parts, above_hz) in every.items():
+        before = [v.line for v in found[c] if v.line]
+        new = [
+            v
+            for v in lines(fine, parts, QUICK_ORDERS)
+            if v.line and (v.line.unit != "Hz" or v.line.order > above_hz)
+            if not any(v.line.unit == x.unit and abs(v.line.order - x.order) < _APART for x in before)
+        ]
+        found[c] += new[:1]
     return Unexplained({c: views for c, views in found.items() if views}, balances)
 
 

@@ -46,15 +46,15 @@ from jtqd.sysid.diagnosis.findings import (
     Untold,
     Value,
     joint_text,
+    shows_at,
 )
 from jtqd.sysid.diagnosis.model import Solution, recorded
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
-from jtqd.sysid.diagnosis.regressors import Index, RunData
+from jtqd.sysid.diagnosis.regressors import Index, RunData, contribution
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.unexplained import (
     Unexplained,
     channel_gaps,
-    contributions,
     held_nm,
     remaining,
     traces,
@@ -312,14 +312,16 @@ def judged(solution: Solution) -> list[Judged]:
 
 
 def _rms(solution: Solution, present: Present) -> dict[Channel, float]:
-    """Return the rms of an effect per channel over valid bins of all runs, a constant in torsion taken off."""
+    """Return the rms of an effect per channel where the balances of all runs are judged, however quick it is; a constant in
+    torsion taken off.
+    """
     squares: dict[Channel, list[FloatArray]] = {}
-    for run, found in zip(solution.dataset.runs, contributions(solution.dataset, present), strict=True):
-        for channel, value in found.items():
-            part = value[run.channels[channel].valid]
-            if channel.balance == "torsion" and len(part):
+    for s in (s for run in solution.dataset.signals for s in run if shows_at(present.joint, s.number)):
+        for balance, value in contribution(present.effect, present.values, s).items():
+            part = np.broadcast_to(value, s.time_s.shape)[s.usable(balance)]
+            if balance == TORSION and len(part):
                 part = part - part.mean()
-            squares.setdefault(channel, []).append(part * part)
+            squares.setdefault(Channel(s.number, balance), []).append(part * part)
     return {
         c: float(np.sqrt(np.mean(np.concatenate(x)))) if sum(map(len, x)) else 0.0 for c, x in squares.items()
     }
@@ -395,7 +397,10 @@ def _cause(
     size_nm = j.rms_nm[channel]
     of = joint if isinstance(joint, int) else min(solution.dataset.joints)
     part = size_nm / limits_nm[Channel(of, channel.balance)]
-    grade, doubts = grade_of(j, hidden=math.sqrt(rest.by_channel().get(channel, 0.0)) > size_nm)
+    alike = sum(
+        v.energy_nm2 for v in rest.views.get(channel, ()) if v.line is None
+    )  # no wave looks like a law
+    grade, doubts = grade_of(j, hidden=math.sqrt(max(alike, 0.0)) > size_nm)
     rivals = [e.effect.name + (f" of {joint_text(e.joint)}" if e.joint != joint else "") for e in j.rivals]
     rivals = list(dict.fromkeys(rivals)) if grade == ONE_OF else []
     cause = Cause(

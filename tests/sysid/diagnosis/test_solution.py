@@ -14,7 +14,7 @@ from jtqd.sysid.diagnosis.entries import set_state
 from jtqd.sysid.diagnosis.findings import Present
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, held_by_spring, joint_signals
-from jtqd.sysid.diagnosis.unexplained import contributions, remaining
+from jtqd.sysid.diagnosis.unexplained import remaining
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, candidates, rigid_run
 from tests.sysid.diagnosis.pendulums import ARM, Rig, runs_of
@@ -119,6 +119,6 @@ def test_what_the_true_effects_leave_is_the_noise() -> None:
     for d, after in zip(dataset.of(MOTOR1), left.residual[MOTOR1], strict=True):
         assert float(np.std(after[d.valid])) < 0.12
         assert float(np.std(d.residual[d.valid])) > 2.0
-    (friction_nm, _) = (found[MOTOR1] for found in contributions(dataset, present[1]))
-    valid = dataset.runs[0].channels[MOTOR1].valid
-    assert np.abs(friction_nm[valid]) == pytest.approx(2.0, rel=1e-2)
+    s = dataset.signals[0][0]
+    friction_nm = np.asarray(contribution(present[1].effect, present[1].values, s)["motor"])
+    assert np.abs(friction_nm[s.usable("motor")]) == pytest.approx(2.0, rel=1e-2)

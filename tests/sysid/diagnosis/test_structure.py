@@ -14,6 +14,7 @@ from jtqd.sysid.diagnosis import structure
 from jtqd.sysid.diagnosis.regressors import RunData
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.structure import (
+    QUICK_ORDERS,
     SIGNIFICANT,
     Balance,
     View,
@@ -295,6 +296,26 @@ def test_a_motor_that_hardly_turns_has_no_orders() -> None:
     still = {"motor_angle": np.linspace(0.0, 20.0, 24 * BLOCK)}
     x = np.cos(3.5 * still["motor_angle"])
     assert order_lines([run_data("run", {MOTOR1: x}, still)], {MOTOR1: [x]}, STEP_S) == []
+
+
+@pytest.mark.parametrize(("order", "hz"), [(24.0, 0.0), (0.0, 35.3)])
+def test_a_quick_wave_is_found_with_its_order_or_frequency(order: float, hz: float) -> None:
+    """Of 0.4 Nm in noise of 1 Nm, at up to 200 Hz; noise alone has none."""
+    step_s, t = 1e-3, 1e-3 * np.arange(12000)
+    angles = [np.cumsum(45.0 + 12.0 * np.sin(0.3 * t + k)) * step_s for k in range(3)]
+    random = np.random.default_rng(5)
+    for amplitude in (0.4, 0.0):
+        parts = [
+            amplitude * np.cos(order * a + 2.0 * np.pi * hz * t) + random.normal(size=len(t)) for a in angles
+        ]
+        parts[0][500:900] = np.nan
+        runs = [RunData(f"run{k}", t, {}, {1: {"time": t, "motor_angle": a}}) for k, a in enumerate(angles)]
+        found = structure.lines(Balance(runs, MOTOR1, step_s, 50.0), parts, QUICK_ORDERS)
+        assert len(found) == (1 if amplitude else 0)
+        for view in found:
+            assert view.line is not None
+            assert view.line.order == pytest.approx(order or hz, abs=0.13)
+            assert view.energy_nm2 == pytest.approx(0.5 * amplitude**2, rel=0.3)
 
 
 def test_a_zero_that_jumps_wanders() -> None:
