@@ -517,18 +517,18 @@ def _require_operational(bus: BootBus, node: int, wait_s: float) -> None:
 
 # As a guest: a bus that another master has booted, or will
 
+Heard = dict[int, list[tuple[int, int]]]
+"""Stamp [ns] and length of the frames of each COB-ID."""
 _LISTEN_S, _FEW, _PERIOD_OFF = 1.2, 5, 0.1
 """A heartbeat of once a second is heard; SYNCs that make a period; its largest difference, as a share."""
 
 
-def known_nodes(
-    request: BootRequest, ids: Collection[int], syncs: Sequence[tuple[int, int]]
-) -> dict[str, Any]:
-    """Return the report of a bus that was listened to; `syncs`: (stamp [ns], length). Raises BootError, EdsError."""
-    notes = _check_sync(request, syncs)
+def known_nodes(request: BootRequest, heard: Heard) -> dict[str, Any]:
+    """Return the report of a bus that was listened to. Raises BootError, EdsError."""
+    notes = _check_sync(request, heard.get(SYNC_COB_ID, []))
     bases = [] if request.listener else [*TPDO_BASES, EMCY_BASE, RESPONSE_ID, nmt.HEARTBEAT_BASE]
     for cob_id in (base + request.master_node for base in bases):
-        if cob_id in ids:
+        if cob_id in heard:
             where, detail = (
                 f"COB-ID {cob_id:03X}h",
                 f"node {request.master_node:02X}h, jtqd's own node-ID, is on the bus",
@@ -560,9 +560,9 @@ def known_nodes(
 
 def _check_sync(request: BootRequest, syncs: Sequence[tuple[int, int]]) -> list[str]:
     """Check the SYNC of the master; return what the operator should know. Raises BootError."""
-    if len(syncs) < _FEW:
+    period_us = interval_us(syncs)
+    if period_us is None:
         return [f"no SYNC within {_LISTEN_S:g} s: jtqd waits for that of the master"]
-    period_us = median(after - before for (before, _), (after, _) in pairwise(syncs)) / 1e3
     wanted_us, counts, expects = request.period_us, syncs[-1][1] > 0, bool(request.sync.counter_overflow)
     if abs(period_us - wanted_us) > _PERIOD_OFF * wanted_us:
         expected = f"one every {wanted_us:g} us (sync.period_us)"
@@ -573,18 +573,24 @@ def _check_sync(request: BootRequest, syncs: Sequence[tuple[int, int]]) -> list[
     return [text] if counts and not expects else []
 
 
-def listen(bus: str, seconds: float) -> tuple[set[int], list[tuple[int, int]]]:
-    """Return the COB-IDs heard on a bus, and the SYNCs as (stamp [ns], length). Raises BusError."""
-    ids, syncs, end = set(), [], time.monotonic() + seconds
+def listen(bus: str, seconds: float) -> Heard:
+    """Return what is heard on a bus: stamp [ns] and length of the frames of each COB-ID. Raises BusError."""
+    heard: Heard = {}
+    end = time.monotonic() + seconds
     with closing(open_frame_socket(bus, [CanFilter(0, CAN_EFF_FLAG | CAN_RTR_FLAG)])) as socket:
         while (left := end - time.monotonic()) > 0.0:
             socket.wait(left)
             for at in range(socket.receive()):
                 can_id, length, _ = FRAME.unpack_from(socket.frames, FRAME_SIZE * at)
-                ids.add(can_id)
-                if can_id == SYNC_COB_ID:
-                    syncs.append((socket.stamps_ns[at], length))
-    return ids, syncs
+                heard.setdefault(can_id, []).append((socket.stamps_ns[at], length))
+    return heard
+
+
+def interval_us(frames: Sequence[tuple[int, int]]) -> float | None:
+    """Return the median interval of frames; None for too few of them."""
+    if len(frames) < _FEW:
+        return None
+    return median(after - before for (before, _), (after, _) in pairwise(frames)) / 1e3
 
 
 def main(argv: list[str]) -> int:
@@ -595,7 +601,7 @@ def main(argv: list[str]) -> int:
         if request.guest:
             with _errors_of_bus(request.bus):
                 heard = listen(request.bus, _LISTEN_S)
-            print(json.dumps(known_nodes(request, *heard) | own), flush=True)
+            print(json.dumps(known_nodes(request, heard) | own), flush=True)
             return 0
         with _bus(request) as bus:
             report = boot(request, bus)

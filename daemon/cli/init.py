@@ -36,11 +36,15 @@ from jtqd.daemon.cli.proposal import (
 )
 from jtqd.daemon.config import MAX_NODE_ID, load_config
 from jtqd.daemon.profiles import names as profile_names
+from jtqd.drivers import nmt
+from jtqd.drivers.boot import Heard, interval_us, listen
 from jtqd.drivers.bus_load import LIMIT, BusLoadError
+from jtqd.drivers.drive import drive_layout
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
+from jtqd.drivers.pdo import EVERY_SYNC, SYNC_COB_ID, TPDO_BASES
 from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Survey
-from jtqd.estimator.command_line import command_parser, count
+from jtqd.estimator.command_line import command_parser, count, seconds
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.files import write_whole
 from jtqd.estimator.text import counted
@@ -52,10 +56,11 @@ _EXAMPLES = """examples:
   jtq init --bus can0 --out arm --node 5 --gear-ratio 101 --rated-torque 28
   jtq init --from-eds drive.eds --node 5 --node 6 --gear-ratio 101 --out arm     before the bus is there
   jtq init --bus can0 --out arm --gear-ratio 101 --gear-ratio 51                 one value for each joint
+  jtq init --bus can0 --listen 10 --from-eds drive.dcf --gear-ratio 101 --out arm     beside a master: only listen
   jtq init --from-csv swing_*.csv                      no bus: column map and joint file for jtq diagnose
 
 Options about joints may be given once for all joints, or once for each in the order of --node.
-Nothing is written to a device. A bus with SYNC is refused: its master reads by SDO, too.
+Nothing is written to a device. A bus with SYNC is refused without --listen: its master reads by SDO, too.
 
 exit status: 0 the files are there and jtqd can use them, 1 failure, 2 usage or something missing,
 3 the files are there, and the devices lack what this version of jtqd needs"""
@@ -124,6 +129,8 @@ def parser() -> argparse.ArgumentParser:
         f"node-ID of a drive; again for the next joint, at most {MAX_JOINTS} (default: drives on the bus; with EDS files "
         "alone 1, 2 as a guess)"
     )
+    text = "with --bus: send nothing, listen for S seconds; for role guest beside another master"
+    add("--listen", type=seconds, metavar="S", help=text)
     add("--node", type=node_id, action="append", metavar="N", help=node)
     add("--sensor", type=_sensor, metavar="N|none", help="node-ID of the torque sensor (default: as found)")
     of_sensor = "joint whose torque the sensor measures (default: all)"
@@ -185,14 +192,28 @@ def _run(options: argparse.Namespace) -> int:
         sensor_node=found.sensor,
         sensor=sensor,
         measured=_measured(options, found),
+        taken={cob_id & 0x7F for cob_id in found.heard},
     )
-    files, period_us = _write(options, joints, text)
+    if found.heard:
+        fixed_us = 50 * round((interval_us(found.heard[SYNC_COB_ID]) or 0.0) / 50)
+        files, period_us = _write(
+            options,
+            joints,
+            lambda period_us: _guest_text(options, found, text(period_us=period_us)),
+            (fixed_us,),
+        )
+    else:
+        files, period_us = _write(options, joints, text)
     report = {
         "files": [str(each) for each in files],
         "period_us": period_us,
         "notes": [*found.notes, *(note for joint in joints for note in _notes(joint))],
         "guesses": [each for joint in joints for each in joint.guesses],
-        "problems": [*(each for joint in joints for each in joint.problems), *sensor_problems(sensor)],
+        "problems": [
+            *(each for joint in joints for each in joint.problems),
+            *sensor_problems(sensor),
+            *(each for each in found.notes if "DOES NOT FIT" in each),
+        ],
         "next": f"jtqd --bus {options.bus or 'can0'} --config {files[-1]} --record logs",
     }
     print(json.dumps(report) if options.json else _text(report))
@@ -232,6 +253,7 @@ class _Devices(NamedTuple):
     surveys: dict[int, Survey]
     notes: list[str]
     guessed: bool
+    heard: Heard
 
 
 def _devices(options: argparse.Namespace) -> _Devices:
@@ -242,7 +264,10 @@ def _devices(options: argparse.Namespace) -> _Devices:
     surveys: dict[int, Survey] = {}
     notes: list[str] = []
     sensor = options.sensor
-    if options.bus is not None:
+    heard: Heard = {}
+    if options.listen is not None:
+        heard, nodes = _listen(options)
+    elif options.bus is not None:
         surveys = _on_the_bus(options.bus, nodes, sensor, options.profile)
         drives = [node for node, each in surveys.items() if each.profile == DRIVE]
         notes += [f"node {node}: {description(each)}" for node, each in surveys.items()]
@@ -266,7 +291,7 @@ def _devices(options: argparse.Namespace) -> _Devices:
             eds = eds_survey(path, node, options.profile)
             surveys[node] = merged(eds, surveys.get(node), path)
             notes.append(f"node {node}: {description(eds)}")
-    if sensor and options.bus is not None and sensor not in surveys:
+    if sensor and options.bus is not None and not heard and sensor not in surveys:
         raise UsageError(f"--sensor: node {sensor} does not answer on {options.bus}{_others(surveys)}")
     _check_profiles(nodes, sensor, surveys)
     notes += [
@@ -274,7 +299,85 @@ def _devices(options: argparse.Namespace) -> _Devices:
         for node in nodes
         if (family := family_of(surveys.get(node), options.profile))
     ]
-    return _Devices(nodes, sensor or None, surveys, notes, guessed)
+    notes += _heard_lines(heard, surveys)
+    return _Devices(nodes, sensor or None, surveys, notes, guessed, heard)
+
+
+def _listen(options: argparse.Namespace) -> tuple[Heard, list[int]]:
+    """Return what is heard on the bus, and the drives: as given, or all that send PDOs. Raises UsageError, BusError."""
+    if options.bus is None:
+        raise UsageError("--listen: expected with --bus")
+    heard = listen(options.bus, options.listen)
+    if interval_us(heard.get(SYNC_COB_ID, [])) is None:
+        silent = f"no SYNC on {options.bus} within {options.listen:g} s"
+        raise UsageError(f"--listen: {silent}: expected a bus in service, with its master")
+    senders = sorted({cob_id & 0x7F for cob_id in heard if cob_id & 0x780 in TPDO_BASES})
+    nodes = options.node or [node for node in senders if _fits(options, node, heard)]
+    if not options.from_eds:
+        print("\n".join(_heard_lines(heard, {})))
+        raise UsageError(
+            "--listen: the objects in a PDO cannot be heard: give --from-eds with the drives' DCF"
+        )
+    if not nodes:
+        raise UsageError(
+            f"--from-eds: it fits none of the nodes that send PDOs: {', '.join(map(str, senders))}"
+        )
+    return heard, nodes
+
+
+def _fits(options: argparse.Namespace, node: int, heard: Heard) -> bool:
+    """Return whether the one EDS or DCF given describes a node: all PDOs heard, and those that it sends at each SYNC."""
+    if not options.from_eds or len(options.from_eds) > 1:
+        return False
+    tpdos = [each for each in eds_survey(options.from_eds[0], node, options.profile).tpdos if each.on]
+    lengths = {each.cob_id: sum(word & 0xFF for word in each.words) // 8 for each in tpdos}
+    found = {
+        cob_id: {length for _, length in frames}
+        for cob_id, frames in heard.items()
+        if cob_id & 0x7F == node and cob_id & 0x780 in TPDO_BASES
+    }
+    cyclic = {each.cob_id for each in tpdos if each.transmission_type == EVERY_SYNC}
+    return cyclic <= found.keys() and all(each == {lengths.get(cob_id)} for cob_id, each in found.items())
+
+
+def _heard_lines(heard: Heard, surveys: Mapping[int, Survey]) -> list[str]:
+    """Return one line for each COB-ID that was heard: length, rate, and what it carries by the node's EDS or DCF."""
+    lines = []
+    for cob_id, frames in sorted(heard.items()):
+        lengths = "/".join(str(each) for each in sorted({length for _, length in frames}))
+        interval = interval_us(frames)
+        rate = "a few" if interval is None else f"{1e6 / interval:.4g} Hz"
+        lines.append(f"{cob_id:03X}h: {lengths} bytes, {rate}: {_carried(cob_id, lengths, surveys)}")
+    return lines
+
+
+def _carried(cob_id: int, lengths: str, surveys: Mapping[int, Survey]) -> str:
+    """Return what a COB-ID is in the predefined connection set, and the objects that fit there."""
+    node, base = cob_id & 0x7F, cob_id & 0x780
+    if base not in TPDO_BASES:
+        names = {0x080: "EMCY", 0x580: "SDO answer", 0x600: "SDO request", nmt.HEARTBEAT_BASE: "heartbeat"}
+        return {0: "NMT", SYNC_COB_ID: "SYNC"}.get(cob_id) or f"{names.get(base, 'RPDO')} of node {node}"
+    survey = surveys.get(node)
+    described = [each for each in survey.tpdos if each.on and each.cob_id == cob_id] if survey else []
+    if not described:
+        own = [each.length for each in drive_layout(node) if each.cob_id == cob_id]
+        fits = (
+            "as long as jtqd's own layout" if lengths in map(str, own) else "another layout than jtqd's own"
+        )
+        return f"TPDO of node {node}, not described: {fits}"
+    bits = sum(word & 0xFF for word in described[0].words)
+    fits = "" if lengths == str(bits // 8) else f", DOES NOT FIT: {bits // 8} bytes expected"
+    return f"TPDO{described[0].number} of node {node}: {', '.join(described[0].objects)}{fits}"
+
+
+def _guest_text(options: argparse.Namespace, found: _Devices, text: str) -> str:
+    """Return a configuration as that of a guest: role, and the EDS or DCF of each joint."""
+    for number, path in enumerate(_each("--from-eds", options.from_eds, len(found.nodes)), 1):
+        line = f"  file: joint_{number}.yaml\n"
+        text = text.replace(line, f"{line}  eds: {path.resolve()}\n")
+    return text.replace(
+        "\nbitrate:", "\nrole: guest               # another master sends SYNC: docs/bus.md\nbitrate:"
+    )
 
 
 def _check_profiles(nodes: Sequence[int], sensor: int | None, surveys: Mapping[int, Survey]) -> None:
@@ -368,7 +471,10 @@ def _answer(why: str, field: str) -> float:
 
 
 def _write(
-    options: argparse.Namespace, joints: Sequence[JointProposal], text: Callable[..., str]
+    options: argparse.Namespace,
+    joints: Sequence[JointProposal],
+    text: Callable[..., str],
+    periods_us: Sequence[int] = _PERIODS_US,
 ) -> tuple[list[Path], int]:
     """Write the files with the shortest period whose bus load fits; returns paths and period [us].
 
@@ -383,7 +489,7 @@ def _write(
         for path, joint in zip(files, joints, strict=False):
             path.write_text(joint_text(joint), encoding="utf-8")
         try:
-            period_us = _fitting_period_us(files[-1], options.bitrate, text)
+            period_us = _fitting_period_us(files[-1], options.bitrate, text, periods_us)
         except ConfigError as error:
             raise ConfigError(str(error).replace(temporary, str(directory))) from None
         for path in files:
@@ -391,12 +497,12 @@ def _write(
     return [directory / each for each in names], period_us
 
 
-def _fitting_period_us(path: Path, bitrate: int, text: Callable[..., str]) -> int:
-    for period_us in _PERIODS_US:
+def _fitting_period_us(path: Path, bitrate: int, text: Callable[..., str], periods_us: Sequence[int]) -> int:
+    for period_us in periods_us:
         path.write_text(text(period_us=period_us), encoding="utf-8")
         if bus_load_of(load_config(path)).worst <= LIMIT:
             return period_us
-    raise ConfigError(f"{path}: at {bitrate} bit/s not even 100 Hz fit the bus")
+    raise ConfigError(f"{path}: at {bitrate} bit/s not even {1e6 / periods_us[-1]:g} Hz fit the bus")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ A guess is scaled from the shipped bench by the rated torque: the order of magni
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
@@ -748,9 +748,10 @@ def config_text(
     sensor_node: int | None = None,
     sensor: Survey | None = None,
     measured: Sequence[int] = (),
+    taken: Collection[int] = (),
 ) -> str:
     """Return the configuration; jtqd has node-ID 20h, or the next that no node has. measured: joints with the sensor."""
-    used = [*(each.node for each in joints), sensor_node, COMMANDER_NODE]
+    used = [*(each.node for each in joints), sensor_node, COMMANDER_NODE, *taken]
     node_id = next(node for node in (JTQD_NODE, *range(JTQD_NODE + 2, 128)) if node not in used)
     lines = [
         f"# jtqd on {bus}. Written by jtq init; docs/deployment.md has all other keys.",

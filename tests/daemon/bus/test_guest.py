@@ -39,7 +39,8 @@ def report(directory: Path, changes: dict[str, Any] | None = None, **heard: Any)
     path.write_text(yaml.safe_dump(content | heard.pop("configuration", {})))
     config = load_config(path, heard.pop("role", "guest"))
     request = boot_request(config, "can0")
-    return known_nodes(request, heard.pop("ids", {0x080}), heard.pop("syncs", SYNCS))
+    frames = {cob_id: [(0, 8)] for cob_id in heard.pop("ids", ())}
+    return known_nodes(request, {**frames, 0x080: heard.pop("syncs", SYNCS)})
 
 
 def test_layout_and_scaling_of_the_configuration(tmp_path: Path) -> None:
