@@ -174,6 +174,11 @@ class Robot:
     def has_sent(self, code: int, since_s: float) -> bool:
         return code == 0 or self.emcys(code, since_s) != []
 
+    def answers(self) -> int:
+        """How many answers come to one SDO request to jtqd's node."""
+        self.socket.send(pack(0x620, bytes.fromhex("4000100000000000")))
+        return sum(can_id == 0x5A0 for _, can_id, _ in self.hear(0.2))
+
     def end(self) -> None:
         for process in (self.jtqd, self.master, self.bench):
             if process.poll() is None:
@@ -212,6 +217,7 @@ def test_beside_a_master_of_the_library(robots: Callable[..., Robot]) -> None:
     assert 19 <= ids.count(0x720) <= 21
     syncs = [at for at, can_id, _ in heard if can_id == 0x080]
     assert len(syncs) == pytest.approx(2000, abs=3)
+    assert robot.answers() == 1
     for order, words, code in (
         ("remap", "node 1: its configuration was changed (1", 0xFF03),
         ("period 0.002", "SYNC does not come every 1000 us", 0x8150),
@@ -232,6 +238,7 @@ def test_beside_a_master_of_the_library(robots: Callable[..., Robot]) -> None:
         ]
         assert order.startswith("pause") or torques == [], order
         robot.until(lambda words=words, lines=lines: words in robot.log.read_text()[lines:], 6.0)
+        assert robot.answers() == (order != "stop")
         robot.order({"remap": "restore", "period 0.002": "period 0.001", "stop": "boot"}.get(order, "start"))
         robot.until(lambda: robot.statuses()[-200:] in ([2] * 200, [3] * 200))
         robot.order("identify")
@@ -245,7 +252,7 @@ def test_a_listener_sends_nothing(robots: Callable[..., Robot]) -> None:
     robot.order("boot")
     heard = robot.hear(6.0)
     assert {can_id for _, can_id, _ in heard}.isdisjoint(OWN)
-    robot.socket.send(pack(0x620, b"\x40\x00\x10\x00\0\0\0\0"))
+    assert robot.answers() == 0
     heard = robot.hear(2.0)
     assert {can_id for _, can_id, _ in heard}.isdisjoint(OWN)
     assert robot.jtqd.wait(20) == 0
