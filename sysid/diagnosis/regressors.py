@@ -386,9 +386,12 @@ def basis_columns(
 
 
 def _axes(s: JointSignals, samples: float) -> dict[str, FloatArray]:
-    """Return the operating conditions, binned; angles unwrapped. Rates of the load [Nm/s, Nm/s^2] as columns are seen."""
+    """Return the operating conditions, binned; angles unwrapped. Rates of the load [Nm/s, Nm/s^2] as columns are seen;
+    what a step of an angle is worth in torsion [Nm].
+    """
     rates = [(1, s.state.torque_rate_nm_s), (2, second_difference(s.state.torque_nm, s.state.time_s))]
     of_load = dict(zip(_RATES, seen_in_bins(s, rates, samples)[1].T, strict=True))
+    of_load[TORSION] = binned(s.rounded_nm, samples)
     return {axis: binned(getattr(s.state, name), samples) for axis, name in _AXES.items()} | of_load
 
 

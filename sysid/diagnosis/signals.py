@@ -36,6 +36,7 @@ from jtqd.sysid.diagnosis.smoothing import (
     mean_ahead,
     noise_of,
     second_difference,
+    steps_of,
 )
 from jtqd.sysid.runs.bad_samples import Held
 
@@ -181,6 +182,9 @@ class JointSignals:
     quick_nm: FloatArray  # what of the torque that motion and load need is too quick to be known
     per_torque: FloatArray | float = 1.0
     twist_rad: FloatArray | None = None  # theta_m/G - theta_l less its zero, smoothed
+    rounded_nm: FloatArray = field(
+        default_factory=lambda: np.zeros(1)
+    )  # what a step of an angle is worth in torsion
     off: BoolArray | None = None
     held: Mapping[str, BoolArray] = field(default_factory=dict)  # by balance: rows of a held channel
     held_nm: Mapping[str, FloatArray] = field(default_factory=dict)  # by balance: what they are worth there
@@ -471,8 +475,9 @@ def joint_signals(  # noqa: PLR0917
     motor_torque = joint.gear_ratio * (
         joint.torque_constant_nm_per_a * columns.current_a - joint.rotor_inertia_kgm2 * motion.whole
     )
-    torsion = bent = None
+    torsion, bent, rounded = None, None, 0.0 * time
     if both:
+        rounded = joint.stiffness_nm_per_rad * (steps_of(motion.position) / joint.gear_ratio + steps_of(link))
         twist = motion.position / joint.gear_ratio - link
         rate = velocity - np.gradient(link, time)
         zero = _zero(twist - gear_torque / joint.stiffness_nm_per_rad, gear_torque)
@@ -493,6 +498,7 @@ def joint_signals(  # noqa: PLR0917
         columns.current_a,
         gear_torque - slow_torque + link_quick + reflected * too_quick,
         twist_rad=bent,
+        rounded_nm=rounded,
         off=None if columns.enabled is None else np.asarray(columns.enabled < 0.5),
         of_position=motion.of_position,
         noise={

@@ -86,6 +86,16 @@ class Balance:
         """The least energy of a view: what is smaller is not listed as an entry either."""
         return float((LISTED * RELEVANCE * self.rated_nm) ** 2)
 
+    @property
+    def steps_nm(self) -> list[FloatArray]:
+        """What a step of an encoder is worth [run][n], Nm; zero of a balance without angles."""
+        return [axes.get(self.channel.balance, np.zeros(len(axes["time"]))) for axes in self.axes]
+
+    @property
+    def coarse_nm2(self) -> float:
+        """The least energy of a wave or of seconds: rounded angles leave waves, and means where motion is slow."""
+        return max(self.least_nm2, float(np.mean(np.concatenate(self.steps_nm) ** 2)) / 12.0)
+
 
 @dataclass(frozen=True)
 class View:
@@ -304,7 +314,7 @@ def lines(balance: Balance, parts: Sequence[FloatArray], orders: FloatArray = OR
     runs, step_s, residual = balance.runs, balance.step_s, {balance.channel: parts}
     out = []
     for found in (*order_lines(runs, residual, step_s, orders), *frequency_lines(runs, residual, step_s)):
-        if found.ratio > STRONG_LINE and 0.5 * found.amplitude_nm**2 > balance.least_nm2:
+        if found.ratio > STRONG_LINE and 0.5 * found.amplitude_nm**2 > balance.coarse_nm2:
             line = sharpened(found, runs, parts, step_s)
             energy = 0.5 * line.amplitude_nm**2
             wave = _wave(line, balance, parts)
@@ -436,8 +446,8 @@ def sharpened(line: Line, runs: Sequence[RunData], parts: Sequence[FloatArray], 
 def events(balance: Balance, parts: Sequence[FloatArray]) -> View | None:
     """Return the events of a residual [run][n], NaN where not valid; None without any.
 
-    Between two changes of its mean over _EVENT_S that are far above the usual, and large enough to matter. A jump, a dip, a
-    dropped reading has one at either end; what lies between two changes close together is one event.
+    Between two changes of its mean over _EVENT_S that are far above the usual, more than a step of an encoder, and large
+    enough to matter. A jump, a dip, a dropped reading has one at either end; what lies between two close together is one.
     """
     wide = max(4, round(_EVENT_S / balance.step_s))
     means = [_means(x, wide) for x in parts]
@@ -446,9 +456,9 @@ def events(balance: Balance, parts: Sequence[FloatArray]) -> View | None:
     usual = float(np.median(every[np.isfinite(every)] ** 2)) if np.isfinite(every).any() else 0.0
     least = max(math.sqrt(_FAR * usual), RELEVANCE * balance.rated_nm)
     found, masks = list[tuple[float, str, float]](), []
-    for run, x, change in zip(balance.runs, parts, changes, strict=True):
+    for run, step, x, change in zip(balance.runs, balance.steps_nm, parts, changes, strict=True):
         mask, end = np.zeros(len(x), bool), -(10**9)  # of the event before
-        for k in np.flatnonzero(np.nan_to_num(change) > least).tolist():
+        for k in np.flatnonzero(np.nan_to_num(change) > np.maximum(least, _means(step, wide)[1:])).tolist():
             first, last = k * wide, (k + 2) * wide
             if first - end <= BLOCK_S / balance.step_s:
                 first = min(first, end)
@@ -534,7 +544,7 @@ def seconds(balance: Balance, parts: Sequence[FloatArray]) -> View | None:
     if not means:
         return None
     far = square[square > _FAR * np.median(square)]
-    all_of_them = np.mean(square) > (RELEVANCE * balance.rated_nm) ** 2
-    if all_of_them or np.sum(far) / len(square) > balance.least_nm2:
+    all_of_them = np.mean(square) > max((RELEVANCE * balance.rated_nm) ** 2, balance.coarse_nm2)
+    if all_of_them or np.sum(far) / len(square) > balance.coarse_nm2:
         return _view("time", parts, prediction, what="seconds", times=_moments(means)[:6])
     return None

@@ -107,7 +107,7 @@ def _quick(dataset: Dataset, present: Sequence[Present]) -> dict[Channel, Quick]
     for s in (s for s in every if s.visible is not s.known_motion):
         samples, rated = samples_in(step, [s]), s.joint.rated_torque_nm
         mine = [contribution(p.effect, p.values, s) for p in present if shows_at(p.joint, s.number)]
-        axes = {"time": s.state.time_s, "motor_angle": s.state.motor_position_rad}
+        axes = {"time": s.state.time_s, "motor_angle": s.state.motor_position_rad, TORSION: s.rounded_nm}
         seen = {s.number: {name: binned(x, samples) for name, x in axes.items()}}
         for balance, known in ((MOTOR, s.motor_nm), (TORSION, s.torsion_nm)):
             if known is not None:

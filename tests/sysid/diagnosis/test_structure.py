@@ -318,6 +318,24 @@ def test_a_quick_wave_is_found_with_its_order_or_frequency(order: float, hz: flo
             assert view.energy_nm2 == pytest.approx(0.5 * amplitude**2, rel=0.3)
 
 
+def test_an_angle_in_few_digits_is_no_structure_where_its_steps_are_known() -> None:
+    """Steps of 0.1 rad of the motor beyond 1000 rad, of 0.01 rad below: 3 and 0.3 Nm in torsion."""
+    t, per_rad = STEP_S * np.arange(24 * BLOCK), 30.0
+    runs, parts, steps = [], [], []
+    for k in range(3):
+        angle = 700.0 + 40.0 * t + 25.0 * np.sin(1.3 * t + k)
+        step = np.where(angle < 1000.0, 0.01, 0.1)
+        parts.append(per_rad * (step * np.round(angle / step) - angle) + 0.02 * noise(k, 24))
+        steps.append(per_rad * step)
+        runs.append(RunData(f"run{k}", t, {}, {1: {"time": t, "motor_angle": angle}}))
+    for known in (True, False):
+        for run, step in zip(runs, steps, strict=True):
+            run.axes[1]["torsion"] = step if known else np.zeros(len(t))
+        of = Balance(runs, TORSION1, STEP_S, 50.0)
+        found = [*structure.lines(of, parts), events(of, parts), seconds(of, parts)]
+        assert [v for v in found if v] == [] if known else any(found)
+
+
 def test_a_zero_that_jumps_wanders() -> None:
     rng = np.random.default_rng(0)
     steady = rng.normal(0.0, 0.5, 6000)
