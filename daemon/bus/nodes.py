@@ -16,7 +16,7 @@ from jtqd.daemon.bus.boot import ReturningNodes
 from jtqd.daemon.shared.events import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers.boot_node import VERIFY_CONFIGURATION, signature
-from jtqd.drivers.nmt import OPERATIONAL, START, STATES
+from jtqd.drivers.nmt import COMMANDS, OPERATIONAL, START, STATES
 from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoQueue
 
 NOT_WATCHED, WAITING, ACTIVE, LOST = 0, 1, 2, 3
@@ -483,7 +483,8 @@ class HeardNodes(NodeCare):
 
     def on_command(self, number: int, node: int) -> None:
         """Take an NMT command."""
-        self._runs |= dict.fromkeys([node] if node else self._expected, number == START)
+        if number in COMMANDS:
+            self._runs |= dict.fromkeys([node] if node else self._expected, number == START)
 
     def on_foreign_request(self, node: int, data: bytes, now_s: float) -> None:
         """Take a frame 600h + node of its master: an upload, or a download with its value."""

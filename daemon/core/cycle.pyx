@@ -53,7 +53,7 @@ cdef uint32_t RESET = cr.FLAG_RESET
 cdef uint32_t NMT_COMMAND = 0, SYNC = SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
 cdef uint8_t OPERATIONAL = nmt.OPERATIONAL, PRE_OPERATIONAL = nmt.PRE_OPERATIONAL, BOOT_UP = nmt.BOOT_UP
 cdef int START = nmt.START, RESET_NODE = nmt.RESET_NODE, RESET_COMMUNICATION = nmt.RESET_COMMUNICATION
-cdef dict STATE_AFTER = nmt.STATE_AFTER
+cdef dict COMMANDS = nmt.COMMANDS, STATE_AFTER = nmt.STATE_AFTER
 cdef int STALE = st.STALE, OFF = st.OFF
 cdef int BUS_ERRORS = word_of("bus_errors"), OVERRUNS = word_of("overruns")
 cdef int LATCH_RESETS = word_of("latch_resets"), CONTACTS = word_of("contacts")
@@ -744,13 +744,15 @@ cdef class Cycle:
 
     cdef int obey(self, int number, int node) except -1:
         """Obey an NMT command, unless there is no heartbeat; other nodes that leave operational may get another mapping."""
+        if number not in COMMANDS:
+            return 0  # no node obeys it
         if number != START:
             self.intake.idle(node)
         if node not in (0, self.node_id) or not self.heartbeat_cycles:
             return 0
         if number in (RESET_NODE, RESET_COMMUNICATION):
             return self.reset_communication()
-        return self.enter(STATE_AFTER.get(number, self.heartbeat_frame.data[0]))
+        return self.enter(STATE_AFTER[number])
 
     cdef int enter(self, uint8_t state) except -1:
         """Enter an NMT state; the supervisor reads it where those of the other nodes are."""

@@ -178,10 +178,13 @@ def test_a_node_is_used_again_when_it_runs_as_described(tmp_path: Path) -> None:
     heard.turn()
     assert (heard.snapshot.configured[1], heard.snapshot.configured_for[1]) == (1, 7)
     assert heard.lines == ["node 1 is operational and used again"]
+    heard.nodes.on_command(0x99, 0)  # no node obeys it
+    heard.turn()
+    assert heard.snapshot.configured[1] == 2, "it still runs"
     heard.nodes.on_command(0x80, 1)
     heard.snapshot.node_states[1] = 5  # of its last heartbeat
     heard.turn()
-    assert heard.snapshot.configured[1] == 1, "its master has commanded it to leave operational"
+    assert heard.snapshot.configured[1] == 2, "its master has commanded it to leave operational"
 
 
 def test_a_sensor_that_nobody_has_described_may_restart(tmp_path: Path) -> None:

@@ -232,6 +232,17 @@ def test_a_node_that_its_master_stops_is_not_used(
     assert any(used[1][100:]) == (node == 1)
 
 
+def test_a_command_that_is_none_changes_nothing(tmp_path: Path, clock: ExactTime) -> None:
+    """No node obeys it: their PDOs are used, and the own node goes on."""
+    wire, begin_ns = Wire(clock), clock.now_ns + PERIOD_NS
+    wire.put(clock.now_ns, nmt(START))
+    wire.put(begin_ns + 100 * PERIOD_NS - 1000, nmt(0x99))
+    loop = Loop(tmp_path, clock, wire.follow(regular(begin_ns))).run(begin_ns + 200 * PERIOD_NS)
+    steps = [JointRecord(*JOINT.unpack_from(each, HEADER.size)).dt_s for each in loop.read()]
+    assert sum(not isnan(each) for each in steps[100:]) > 80
+    assert len(wire.estimates()) == 200
+
+
 def test_silence_shows_where_the_loop_is_asked(tmp_path: Path, clock: ExactTime) -> None:
     """Without SYNC: status starting before the first, stale after the last, within 0.2 s; the snapshot goes on."""
     loop = Loop(tmp_path, clock, Wire(clock))
