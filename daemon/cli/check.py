@@ -27,7 +27,7 @@ from jtqd.daemon.cli.checks import (
 )
 from jtqd.daemon.cli.running import Daemon, find_daemons, on_bus
 from jtqd.daemon.cli.traffic import Traffic, drive, leave, listen, silent
-from jtqd.daemon.config import Config, as_booted, load_config
+from jtqd.daemon.config import MASTER, Config, as_booted, load_config
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.conditions import read_conditions
@@ -89,11 +89,15 @@ def main(argv: list[str]) -> int:
             daemon is not None and daemon.about.configuration_sha256 == config.sha256
         ):  # then as its drives have it
             config = as_booted(config, {node: {"tpdos": each} for node, each in daemon.about.tpdos.items()})
+        drives = arguments.drive_sync or arguments.bus == "sim"
+        if drives and config.role != MASTER:
+            who = f"{config.path}: role {config.role}: another master sends SYNC and boots the nodes"
+            raise CheckError(f"{who}: on its bus, without --drive-sync, this check listens")
         before_s, began_s = stolen_s(), time.monotonic()
         with _bus(arguments.bus, config, daemon) as bus:
             results = list(
                 _drive(bus, config, arguments.seconds, daemon)
-                if arguments.drive_sync or arguments.bus == "sim"
+                if drives
                 else _listen(bus, config, arguments.seconds, daemon)
             )
         results.append(check_stolen_time(stolen_s() - before_s, time.monotonic() - began_s))

@@ -42,7 +42,7 @@ from jtqd.drivers.bus_load import LIMIT, BusLoadError
 from jtqd.drivers.drive import drive_layout
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
-from jtqd.drivers.pdo import EVERY_SYNC, SYNC_COB_ID, TPDO_BASES
+from jtqd.drivers.pdo import EVERY_SYNC, SYNC_COB_ID, TPDO_BASES, Tpdo
 from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Survey
 from jtqd.estimator.command_line import command_parser, count, seconds
 from jtqd.estimator.errors import ConfigError
@@ -329,15 +329,21 @@ def _fits(options: argparse.Namespace, node: int, heard: Heard) -> bool:
     """Return whether the one EDS or DCF given describes a node: all PDOs heard, and those that it sends at each SYNC."""
     if not options.from_eds or len(options.from_eds) > 1:
         return False
-    tpdos = [each for each in eds_survey(options.from_eds[0], node, options.profile).tpdos if each.on]
+    survey = eds_survey(options.from_eds[0], node, options.profile)
+    tpdos = [each for each in survey.tpdos if each.on]
     lengths = {each.cob_id: sum(word & 0xFF for word in each.words) // 8 for each in tpdos}
     found = {
         cob_id: {length for _, length in frames}
         for cob_id, frames in heard.items()
         if cob_id & 0x7F == node and cob_id & 0x780 in TPDO_BASES
     }
-    cyclic = {each.cob_id for each in tpdos if each.transmission_type == EVERY_SYNC}
+    cyclic = {each.cob_id for each in _cyclic(survey)}
     return cyclic <= found.keys() and all(each == {lengths.get(cob_id)} for cob_id, each in found.items())
+
+
+def _cyclic(survey: Survey) -> list[Tpdo]:
+    """Return the TPDOs that a node sends at each SYNC."""
+    return [each for each in survey.tpdos if each.on and each.transmission_type == EVERY_SYNC]
 
 
 def _heard_lines(heard: Heard, surveys: Mapping[int, Survey]) -> list[str]:
@@ -348,6 +354,12 @@ def _heard_lines(heard: Heard, surveys: Mapping[int, Survey]) -> list[str]:
         interval = interval_us(frames)
         rate = "a few" if interval is None else f"{1e6 / interval:.4g} Hz"
         lines.append(f"{cob_id:03X}h: {lengths} bytes, {rate}: {_carried(cob_id, lengths, surveys)}")
+    for node, survey in surveys.items() if heard else ():
+        silent = [each for each in _cyclic(survey) if each.cob_id not in heard]
+        lines += [
+            f"{each.cob_id:03X}h: DOES NOT FIT: TPDO{each.number} of node {node} is not heard"
+            for each in silent
+        ]
     return lines
 
 

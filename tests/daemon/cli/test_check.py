@@ -428,3 +428,13 @@ def test_numbers_for_people() -> None:
         *("0 B", "999 B", "1 kB", "123 kB", "1.23 GB", "-")
     ]
     assert (number(-1.005), number(NAN), percent(0.8476), percent(NAN)) == ("-1.00", "-", "84.8 %", "-")
+
+
+@pytest.mark.parametrize("options", [["--bus", "sim"], ["--bus", "unix:nowhere", "--drive-sync"]])
+def test_sync_of_another_master_is_not_sent(
+    options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "guest.yaml"
+    path.write_text(yaml.safe_dump(shipped_bench() | {"role": "guest"}))
+    assert main(["1", "--config", str(path), *options]) == 1
+    assert "role guest: another master sends SYNC" in capsys.readouterr().err
