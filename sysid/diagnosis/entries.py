@@ -35,12 +35,9 @@ _MOST_STEPS: Final = 8
 _DRAWS: Final = 20
 _MOST_CURRENT: Final = 4.0
 """Of the largest current that the file alone draws."""
-_NO_STEP: Final = 1e-6
-"""Of that: smaller steps of the current are none."""
-_SLOPES: Final = -4.0, -0.5
-"""Of what is lacking over the current: -1 where effects see no current."""
-_TORSION_STEP: Final = 1e-4
-"""Of the twist at the rated torque: smaller steps of the torsion are none."""
+_NO_STEP: Final = 1e-6  # of that: smaller steps of the current are none
+_SLOPES: Final = -4.0, -0.5  # of what is lacking over the current: -1 where effects see no current
+_TORSION_STEP: Final = 1e-4  # of the twist at the rated torque: smaller steps of the torsion are none
 _SOFTEST: Final = 0.1
 """Of the file's stiffness: less is taken for no spring, nor is a twist as under so little of it."""
 _KINDS: Final = ("order_per_motor_rev", "channel", "motor_side")
@@ -240,6 +237,8 @@ def set_state(s: JointSignals, present: Sequence[Present]) -> None:
     )
     s.believed[:] = [with_effects_applied(replace(s.joint, effects=values))]
     _set_torsion(s, mine)
+    # what a sensor reads too much drives no motor
+    mine = [p for p in mine if "current_a" not in p.effect.hooks]
     acting = [p for p in mine if "current_a" in fields_used(p.effect, p.values, s.joint)]
     rest = s.demand_nm + _sum(s, [p for p in mine if p not in acting], MOTOR)
     s.state.current_a = rest / s.nm_per_a

@@ -78,6 +78,10 @@ def test_the_current_is_that_which_a_simulation_with_these_effects_needs() -> No
     kt = {"torque_constant_nm_per_a": 0.85 * PLAIN.torque_constant_nm_per_a}
     set_state(s, [Present("torque_constant", 1, kt)])
     assert s.state.current_a == pytest.approx(s.demand_nm / (0.85 * per_a), rel=1e-4, abs=1e-6)
+    set_state(s, [Present("torque_constant", 1, kt), Present("current_offset", 1, {"offset_a": 0.3})])
+    assert s.state.current_a == pytest.approx(s.demand_nm / (0.85 * per_a), rel=1e-4, abs=1e-6), (
+        "what the sensor reads too much drives no motor"
+    )
     more = {"coulomb_nm": PLAIN.friction.coulomb_nm + 1.5}
     both = [
         Present("torque_constant", 1, kt),
