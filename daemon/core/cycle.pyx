@@ -49,7 +49,7 @@ cdef int LAST_NUMBER = 240  # of the cycles of a SYNC without counter, in estima
 cdef int ENDED = CYCLE_ENDED, PASSED = SLOT_PASSED, OVER = RUN_ENDED
 cdef uint32_t COMPLETE = cr.FLAG_COMPLETE, PUBLISHED = cr.FLAG_PUBLISHED, WITHDRAWN = cr.FLAG_WITHDRAWN
 cdef uint32_t BEFORE_NEXT_SYNC = cr.FLAG_BEFORE_NEXT_SYNC, SYNC_CONFIRMED = cr.FLAG_SYNC_CONFIRMED
-cdef uint32_t RESET = cr.FLAG_RESET
+cdef uint32_t RESET = cr.FLAG_RESET, UNCHECKED = cr.FLAG_UNCHECKED, FIRST_ONES = cr.FLAG_STARTING
 cdef uint32_t NMT_COMMAND = 0, SYNC = SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
 cdef uint8_t OPERATIONAL = nmt.OPERATIONAL, PRE_OPERATIONAL = nmt.PRE_OPERATIONAL, BOOT_UP = nmt.BOOT_UP
 cdef int START = nmt.START, RESET_NODE = nmt.RESET_NODE, RESET_COMMUNICATION = nmt.RESET_COMMUNICATION
@@ -546,6 +546,10 @@ cdef class Cycle:
         for n in range(self.count):
             wanted = self.budget.wanted(n, self.clock.monotonic())
             (<JointCycle> self.at[n]).observe(sync_ns, starting, wanted)
+            if (<JointCycle> self.at[n]).rules.at_most_degraded:
+                self.flags |= UNCHECKED << (2 + n)
+        if starting and self.first_index:
+            self.flags |= FIRST_ONES
         if self.watches:
             self.contacts.watch(self.states)
             self.writer.counters[CONTACTS] += self.contacts.begun

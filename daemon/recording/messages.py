@@ -88,6 +88,8 @@ uint8 BEFORE_NEXT_SYNC=4   # ... before the next SYNC was due
 uint8 SYNC_CONFIRMED=8     # header.stamp is the send time of the SYNC on the wire, not the time of the call
 uint8 WITHDRAWN=16         # the estimate was not ready before the next SYNC
 uint8 LATCHES_RESET=32     # latched faults were reset before this cycle
+uint8 UNCHECKED=64         # as a guest: status at most degraded, as nobody has checked the drive's identity
+uint8 FIRST_CYCLES=128     # as a guest: one of the first cycles with SYNC
 
 std_msgs/Header header          # send time of the cycle's SYNC, CLOCK_REALTIME
 uint64 cycle                    # cycles since the start, missed slots included
@@ -475,10 +477,11 @@ class CycleMessages:
         seconds, nanoseconds = divmod(realtime_ns, _NS)
         frames = min(frames, self._capacity)
         stamp = (index & _MASK, realtime_ns, realtime_ns, CDR_HEADER, seconds & _MASK, nanoseconds)
-        head, end = record[_INDEX_AND_MONOTONIC], (sync_counter, flags & 0xFF)
+        head, common = record[_INDEX_AND_MONOTONIC], flags & 0xFF & ~cycle.FLAG_UNCHECKED
         values: list[bytes | int] = []
-        for start, frame_id, joint in self._joints:
-            values += (start, *stamp, frame_id, head, record[joint], *end)
+        for n, (start, frame_id, joint) in enumerate(self._joints, 2):
+            own = common | flags >> n & cycle.FLAG_UNCHECKED
+            values += (start, *stamp, frame_id, head, record[joint], sync_counter, own)
         for start, frame_id, block in self._shadows:
             values += (start, *stamp, frame_id, head, record[block])
         return self._pack(

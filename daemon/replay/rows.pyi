@@ -27,7 +27,7 @@ class CycleRows:
         counter: npt.NDArray[np.integer],
         sync_ns: IntegerArray | Sequence[IntegerArray],
         wanted: BoolArray | Sequence[BoolArray],
-        withdrawn: BoolArray,
+        flags: Sequence[npt.NDArray[np.uint8]],
         velocity: FloatArray | Sequence[FloatArray] | None = None,
         contacts: ContactWatch | None = None,
     ) -> None: ...

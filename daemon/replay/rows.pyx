@@ -13,10 +13,11 @@ from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into, field
 from jtqd.daemon.core.intake cimport MOST_FIELDS, Intake, Temperature
 from jtqd.daemon.core.joint cimport JointCycle, JointState
 from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock, ShadowBlock
+from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator import status as st
 
 cdef int64_t FIRST_CYCLES = STARTING_CYCLES
-cdef int STALE = st.STALE
+cdef int STALE = st.STALE, WITHDRAWN = cr.FLAG_WITHDRAWN, UNCHECKED = cr.FLAG_UNCHECKED, STARTING = cr.FLAG_STARTING
 
 
 def fields(torque_nm, sigma_nm, status):
@@ -45,7 +46,7 @@ cdef class CycleRows:
         cycle, counter: number of the cycle, and its SYNC counter [n].
         sync_ns: of each joint, when its SYNC went out [joints, n].
         wanted: of each joint, whether there was time for the network [joints, n].
-        withdrawn: whether the estimate was too late [n].
+        flags: of each joint, its `cycle_flags`, as logged [joints, n].
         contacts: the loop's, None where they are not watched.
         velocity: of each joint, the motor velocity as logged [joints, n], for drives without one; None: derived again.
 
@@ -62,12 +63,11 @@ cdef class CycleRows:
     cdef tuple joints
     cdef int count, pdos
     cdef JointState *states[MOST_JOINTS]
-    cdef const uint8_t[:, ::1] fresh, wanted
+    cdef const uint8_t[:, ::1] fresh, wanted, flags
     cdef const int64_t[:, :, ::1] values
     cdef const double[:, ::1] celsius
     cdef const int64_t[::1] cycle, counter
     cdef const int64_t[:, ::1] sync_ns
-    cdef const uint8_t[::1] withdrawn
     cdef const double[:, ::1] velocity
     cdef bint with_velocity
     cdef ContactWatch contacts
@@ -78,7 +78,7 @@ cdef class CycleRows:
     cdef readonly int64_t temperatures_from_log
 
     def __init__(
-        self, Intake intake, joints, *, fresh, values, celsius, cycle, counter, sync_ns, wanted, withdrawn, velocity=None,
+        self, Intake intake, joints, *, fresh, values, celsius, cycle, counter, sync_ns, wanted, flags, velocity=None,
         ContactWatch contacts=None
     ):
         cdef JointCycle joint
@@ -97,7 +97,7 @@ cdef class CycleRows:
         self.celsius = _checked(celsius, np.float64, (intake.temperature_count, n))
         self.cycle, self.counter = _checked(cycle, np.int64, (n,)), _checked(counter, np.int64, (n,))
         self.sync_ns = _checked(sync_ns, np.int64, (self.count, n))
-        self.wanted, self.withdrawn = _checked(wanted, np.uint8, (self.count, n)), _checked(withdrawn, np.uint8, (n,))
+        self.wanted, self.flags = _checked(wanted, np.uint8, (self.count, n)), _checked(flags, np.uint8, (self.count, n))
         self.with_velocity = velocity is not None
         self.velocity = _checked(np.zeros((self.count, n)) if velocity is None else velocity, np.float64, (self.count, n))
         size = sizeof(JointBlock) + (sizeof(ShadowBlock) if self.states[0].shadow != NULL else 0)
@@ -123,7 +123,7 @@ cdef class CycleRows:
                 self.observe(<JointCycle> at[n], n, row)
             if self.watches:
                 self.contacts.watch(self.states)
-            if self.withdrawn[row]:
+            if self.flags[0, row] & WITHDRAWN:
                 for n in range(self.count):
                     (<JointCycle> at[n]).withdraw(STALE)
                 if self.watches:
@@ -157,9 +157,13 @@ cdef class CycleRows:
 
     cdef void observe(self, JointCycle joint, int number, Py_ssize_t row) noexcept nogil:
         """Estimate one joint in a row."""
+        cdef bint starting
         joint.derived.is_replayed = self.with_velocity
         joint.derived.replayed_rad_s = self.velocity[number, row]
-        joint.observe(self.sync_ns[number, row], self.cycle[row] < FIRST_CYCLES, self.wanted[number, row])
+        cdef int flags = self.flags[number, row]
+        joint.rules.at_most_degraded = (flags & UNCHECKED) != 0
+        starting = self.cycle[row] < FIRST_CYCLES or (flags & STARTING) != 0
+        joint.observe(self.sync_ns[number, row], starting, self.wanted[number, row])
 
 
 def _checked(values, kind, shape):

@@ -170,7 +170,7 @@ class Replayer:
             sync_ns=times,
             wanted=[(each["input_flags"] & cr.FLAG_NETWORK_SKIPPED) == 0 for each in joints],
             contacts=self._contacts,
-            withdrawn=(joints[0]["cycle_flags"] & cr.FLAG_WITHDRAWN) != 0,
+            flags=[each["cycle_flags"] for each in joints],
         )
         for first, end in pairwise(sorted({*events, *range(0, count, _PROGRESS_CYCLES), count})):
             for happen in events.get(first, ()):

@@ -90,6 +90,8 @@ FLAG_WITHDRAWN = 0x10
 """The estimate was not ready before the next SYNC was due: all joints were stale (`JointCycle.withdraw`)."""
 FLAG_RESET = 0x20
 """Latched faults were reset just before this cycle's estimate (`JointCycle.reset_latch`)."""
+FLAG_UNCHECKED, FLAG_STARTING = 0x40, 0x80
+"""As a guest: status at most degraded (of joint n from 0 on; in the header bit 8 + n); one of the first cycles with SYNC."""
 
 FLAG_POSITION, FLAG_MOTION, FLAG_SENSOR, FLAG_TEMPERATURE = 1, 2, 4, 8
 """`input_flags` of record and snapshot: TPDO1, TPDO2 and the sensor's PDO are of this cycle; the temperature is known."""

@@ -281,7 +281,7 @@ def test_rows_of_a_log_give_the_same_bits(tmp_path: Path, exact: ExactTime) -> N
         counter=np.array([each.sync_counter for each in headers]),
         sync_ns=np.array([[each.sync_realtime_ns for each in headers]] * 2),
         wanted=np.ones((2, CYCLES), bool),
-        withdrawn=np.zeros(CYCLES, bool),
+        flags=np.zeros((2, CYCLES), np.uint8),
         contacts=ContactWatch([THRESHOLD_NM] * 2, opposed=True),
     )
     rows.go_on(0, CYCLES)

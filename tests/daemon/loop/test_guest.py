@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from jtqd.daemon.recording.messages import CycleMessages
+from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import FLAG_PUBLISHED, HEADER, JOINT, Header, JointRecord
-from jtqd.estimator.status import PUBLISHED, STALE, VALID
+from jtqd.estimator.status import DEGRADED, PUBLISHED, STALE, VALID
 from tests.daemon.loop.cycle_helpers import ExactTime, frame, moving
 from tests.daemon.loop.foreign_master import (
     OWN,
@@ -241,6 +243,26 @@ def test_a_command_that_is_none_changes_nothing(tmp_path: Path, clock: ExactTime
     steps = [JointRecord(*JOINT.unpack_from(each, HEADER.size)).dt_s for each in loop.read()]
     assert sum(not isnan(each) for each in steps[100:]) > 80
     assert len(wire.estimates()) == 200
+
+
+def test_what_bounds_a_guests_status_is_in_the_record(tmp_path: Path, clock: ExactTime) -> None:
+    """So that a replay has the same status: the first cycles with SYNC, and joints whose drive nobody has checked."""
+    loop = Loop(tmp_path, clock, Wire(clock))
+    begin_ns = clock.now_ns + 1000 * PERIOD_NS
+    loop.wire.put(begin_ns - PERIOD_NS, nmt(START))
+    loop.wire.follow(regular(begin_ns))
+    loop.reader.note_checked(2, checked=False)
+    loop.cycle.configured_nodes.doubt()
+    loop.run(begin_ns + 40 * PERIOD_NS)
+    records = loop.read()
+    flags = [header_of(each).flags for each in records]
+    assert {each & 0xF00 for each in flags} == {cr.FLAG_UNCHECKED << 3}
+    assert [each & cr.FLAG_STARTING != 0 for each in flags] == [True] * 20 + [False] * (len(flags) - 20)
+    own = [JointRecord(*JOINT.unpack_from(records[-1], HEADER.size + n * JOINT.size)).status for n in (0, 1)]
+    assert own == [VALID, DEGRADED]
+    block = CycleMessages(2).block(records[-1], 1, 0, flags=flags[-1], sync_counter=1, frames=0)
+    ends = [payload[-1] & cr.FLAG_UNCHECKED for _, payload in CycleMessages(2).payloads(block)]
+    assert ends[:2] == [0, cr.FLAG_UNCHECKED]
 
 
 def test_silence_shows_where_the_loop_is_asked(tmp_path: Path, clock: ExactTime) -> None:

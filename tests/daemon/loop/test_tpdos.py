@@ -181,7 +181,7 @@ def test_a_replay_of_rows_reads_the_same_places(tmp_path: Path, less: Any) -> No
         counter=np.arange(count) % 240 + 1,
         sync_ns=(MS + np.cumsum(np.rint(dt_s * 1e9)).astype(np.int64))[None],
         wanted=np.ones((1, count), np.uint8),
-        withdrawn=np.zeros(count, np.uint8),
+        flags=np.zeros((1, count), np.uint8),
         velocity=[np.array([each.motor_velocity_rad_s for each in records])],
     )
     rows.go_on(0, count)

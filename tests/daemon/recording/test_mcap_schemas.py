@@ -82,7 +82,7 @@ def test_cycle_block_decodes_to_the_record(seed):
         assert message.pop("cycle") == header.cycle
         assert message.pop("sync_monotonic_ns") == header.sync_monotonic_ns
         assert message.pop("sync_counter") == header.sync_counter
-        assert message.pop("cycle_flags") == header.flags & 0xFF
+        assert message.pop("cycle_flags") == header.flags & 0xBF | (header.flags >> 7 + number & 1) << 6
         assert message == joints[number - 1]._asdict()
     message = FRAMES.decode(parts[2][4])
     assert message["header"] == {"stamp": stamp, "frame_id": "can"}
@@ -118,7 +118,7 @@ def test_joint_message_literally():
         "00000000"  # to a multiple of 8
     )
     assert payload[28:44] == bytes.fromhex("0807060504030201 1100000000000000")
-    assert payload[-2:] == bytes.fromhex("f0 0f")
+    assert payload[-2:] == bytes.fromhex("f0 4f")
 
 
 @pytest.mark.parametrize(
@@ -200,6 +200,7 @@ def test_status_constants_are_those_of_the_pdo():
     names = ("INPUT_TPDO1", "INPUT_TPDO2", "INPUT_SENSOR", "INPUT_TEMPERATURE")
     flags |= {name: getattr(cr, f"FLAG_{part}") for name, part in zip(names, inputs, strict=True)}
     flags |= {"WITHDRAWN": cr.FLAG_WITHDRAWN, "LATCHES_RESET": cr.FLAG_RESET}
+    flags |= {"UNCHECKED": cr.FLAG_UNCHECKED, "FIRST_CYCLES": cr.FLAG_STARTING}
     flags |= {
         "NETWORK_SKIPPED": cr.FLAG_NETWORK_SKIPPED,
         "FAULT_LATCHED": cr.FLAG_LATCHED,

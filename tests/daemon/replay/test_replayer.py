@@ -19,6 +19,7 @@ from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.logs import read_topic
 from jtqd.daemon.replay.logged import SAMPLE, Pdo, decode, offsets, read_runs
 from jtqd.daemon.replay.rows import CycleRows, fields
+from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.estimator.estimator import make_estimator
 from jtqd.estimator.joint import FusedSigma, Joint
@@ -66,6 +67,14 @@ def made() -> tuple[Intake, list[JointCycle]]:
     return intake, joints
 
 
+def guest_flags(rng: np.random.Generator) -> np.ndarray:
+    """Of two joints, the first of which is unchecked for a while; SYNC is new at row 40."""
+    flags = np.zeros((2, ROWS), int)
+    flags[0, 100 : rng.integers(200, 300)] |= cr.FLAG_UNCHECKED
+    flags[:, 40:60] |= cr.FLAG_STARTING
+    return flags
+
+
 def log(seed: int) -> dict[str, Any]:
     """Inputs as a log has them; printed seed, everything that may happen to a cycle in it."""
     rng = np.random.default_rng(seed)
@@ -99,7 +108,8 @@ def log(seed: int) -> dict[str, Any]:
         "counter": np.arange(ROWS) % 240 + 1,
         "sync_ns": (1 << 60) + np.cumsum(dt, axis=1),
         "wanted": rng.random((2, ROWS)) > 0.05,
-        "withdrawn": rng.random(ROWS) < 0.03,
+        "flags": np.array([rng.random(ROWS) < 0.03] * 2) * np.uint8(cr.FLAG_WITHDRAWN)
+        | guest_flags(rng).astype(np.uint8),
     }
 
 
@@ -120,10 +130,11 @@ def test_rows_are_what_the_joints_make_of_each_cycle(seed: int) -> None:
                 intake.receive_temperature(n, frame)
                 from_log += 1
         for n, joint in enumerate(joints):
-            joint.observe(
-                int(given["sync_ns"][n, row]), bool(given["cycle"][row] < 20), bool(given["wanted"][n, row])
-            )
-            if given["withdrawn"][row]:
+            flags = given["flags"][n, row]
+            joint.trust(not flags & cr.FLAG_UNCHECKED)
+            starting = bool(given["cycle"][row] < 20 or flags & cr.FLAG_STARTING)
+            joint.observe(int(given["sync_ns"][n, row]), starting, bool(given["wanted"][n, row]))
+            if flags & cr.FLAG_WITHDRAWN:
                 joint.withdraw(STALE)
             samples[n].append(joint.sample)
         pdos += estimate_pdo.encode(joints[0].published, joints[1].published, int(given["counter"][row]))
@@ -139,12 +150,12 @@ def test_rows_are_what_the_joints_make_of_each_cycle(seed: int) -> None:
     assert rows.temperatures_from_log == from_log == 2
     published = rows.samples[0].view(SAMPLE)[:, 0]["status"]
     assert {1, 2, 3, 4, 5, 6} <= set(published.tolist())
-    assert (published[given["withdrawn"]] != 2).all()
+    assert (published[given["flags"][0] != 0] != 2).all()
 
 
 def test_arrays_that_do_not_fit_are_refused() -> None:
     intake, joints = made()
-    for key in ("fresh", "celsius", "counter", "sync_ns", "wanted", "withdrawn"):
+    for key in ("fresh", "celsius", "counter", "sync_ns", "wanted", "flags"):
         given = log(1)
         given[key] = given[key][..., :-1]
         with pytest.raises(ValueError, match="found an array of shape"):
