@@ -311,11 +311,12 @@ def entries_from_json(rows: Any) -> list[Entry]:
 
 def _entry(variable: Any) -> Entry:
     """Return one variable of a parsed EDS, or member of an array or record."""
-    data_type, default = int(variable.data_type), variable.default
-    if variable.value is not None:  # ParameterValue of a DCF: what the device is configured with
-        default = variable.value
+    data_type, of_dcf = int(variable.data_type), getattr(variable, "value_raw", "")  # as it is configured
+    default = variable.default if variable.value is None else variable.value
     layout = _LAYOUTS.get(data_type)
     if layout is not None:
+        if of_dcf and variable.value is None:
+            raise ValueError(f"ParameterValue={of_dcf} of {variable.name}, expected a number")
         default = layout.pack(default if default is not None else 0)
     elif not isinstance(default, bytes):
         default = b"" if default is None else str(default).encode("ascii")
