@@ -21,7 +21,7 @@ from jtqd.sysid.diagnosis.diagnose import disturbed_signals
 from jtqd.sysid.diagnosis.entries import set_state
 from jtqd.sysid.diagnosis.findings import Findings, Present
 from jtqd.sysid.diagnosis.model import Solution, solve
-from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
+from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned, contribution
 
 Loss = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 """Of velocity, torque, motor angle [n], joint side, Nm."""
@@ -142,11 +142,13 @@ def predicted(joint: Joint, effects: Effects, runs: Runs) -> list[dict[str, Floa
     out = []
     for (s,) in signals:
         set_state(s, present)
+        read = [p for p in present if "current_a" in p.effect.hooks]
+        more = sum(contribution(p.effect, p.values, s)["motor"] for p in read)
         samples = bin_samples([s])
         good = all_in_bin(s.usable("motor"), samples)
         columns = {
             "measured": scale * s.current_a,
-            "predicted": scale * s.state.current_a,
+            "predicted": scale * s.state.current_a + more,
             "velocity": s.state.velocity_rad_s,
             "acceleration": s.state.motor_acceleration_rad_s2 / joint.gear_ratio,
             "load": s.state.torque_nm,
