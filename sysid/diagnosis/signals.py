@@ -182,9 +182,8 @@ class JointSignals:
     quick_nm: FloatArray  # what of the torque that motion and load need is too quick to be known
     per_torque: FloatArray | float = 1.0
     twist_rad: FloatArray | None = None  # theta_m/G - theta_l less its zero, smoothed
-    rounded_nm: FloatArray = field(
-        default_factory=lambda: np.zeros(1)
-    )  # what a step of an angle is worth in torsion
+    # what a step of an angle is worth in torsion
+    rounded_nm: FloatArray = field(default_factory=lambda: np.zeros(1))
     off: BoolArray | None = None
     held: Mapping[str, BoolArray] = field(default_factory=dict)  # by balance: rows of a held channel
     held_nm: Mapping[str, FloatArray] = field(default_factory=dict)  # by balance: what they are worth there

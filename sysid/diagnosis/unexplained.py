@@ -104,7 +104,7 @@ def _quick(dataset: Dataset, present: Sequence[Present]) -> dict[Channel, Quick]
     """Return what effects leave of channels that are judged below a frequency which is not the noise's, unfiltered."""
     every = [s for run in dataset.signals for s in run]
     step, out = max(s.step_s for s in every), dict[Channel, Quick]()
-    for s in (s for s in every if s.visible is not s.known_motion):
+    for s in (s for s in every if s.visible.slowest_hz < s.known_motion.slowest_hz):
         samples, rated = samples_in(step, [s]), s.joint.rated_torque_nm
         mine = [contribution(p.effect, p.values, s) for p in present if shows_at(p.joint, s.number)]
         axes = {"time": s.state.time_s, "motor_angle": s.state.motor_position_rad, TORSION: s.rounded_nm}

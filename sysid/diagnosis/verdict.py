@@ -397,9 +397,8 @@ def _cause(
     size_nm = j.rms_nm[channel]
     of = joint if isinstance(joint, int) else min(solution.dataset.joints)
     part = size_nm / limits_nm[Channel(of, channel.balance)]
-    alike = sum(
-        v.energy_nm2 for v in rest.views.get(channel, ()) if v.line is None
-    )  # no wave looks like a law
+    # no wave looks like a law
+    alike = sum(v.energy_nm2 for v in rest.views.get(channel, ()) if v.line is None)
     grade, doubts = grade_of(j, hidden=math.sqrt(max(alike, 0.0)) > size_nm)
     rivals = [e.effect.name + (f" of {joint_text(e.joint)}" if e.joint != joint else "") for e in j.rivals]
     rivals = list(dict.fromkeys(rivals)) if grade == ONE_OF else []
