@@ -154,7 +154,7 @@ class OwnNode:
             self._asked = self._reader.ask_reset()
 
     def _counter(self, name: str) -> int:
-        value = self.recorder_lost if name == RECORDER_LOST.name else self._reader.read().counters[name]
+        value = self.recorder_lost if name == RECORDER_LOST.name else self._reader.count(name)
         return value & 0xFFFF_FFFF if name == "bits_worst_case" else min(value, 0xFFFF_FFFF)
 
     def _work_us(self, share: float) -> int:

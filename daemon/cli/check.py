@@ -136,10 +136,10 @@ def _listen(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> It
     else:
         try:
             reader = SnapshotReader(daemon.directory / "snapshot")
+            bins, view = reader.late_bins(), reader.read()
         except SharedMemoryError as error:
             raise CheckError(f"jtqd on {daemon.about.instance} is still starting ({error})") from None
         _progress(f"listening on {bus} for {for_s:g} s beside jtqd, process {daemon.about.pid}")
-        bins, view = reader.late_bins(), reader.read()
         listen(socket, traffic, for_s, 10 * config.period_ns)
         yield check_loop_timing(bins, reader.late_bins(), view, reader.read())
     yield from _check_traffic(traffic, config, bus, socket)

@@ -175,10 +175,14 @@ class Watch:
 
     def read(self) -> Reading:
         """Read the present state."""
-        view = self._view()
-        if view is None:
-            return Reading(self.daemon, STARTING, "booting its nodes")
-        assert self._reader is not None
+        booting = Reading(self.daemon, STARTING, "booting its nodes")
+        try:
+            self._reader = self._reader or SnapshotReader(self.daemon.directory / "snapshot")
+            view = self._reader.read()
+        except SharedMemoryError as error:
+            return Reading(self.daemon, STILL, f"not read: {error}") if self._reader else booting
+        if not view.sync_monotonic_ns:
+            return booting
         earlier, self._earlier = self._earlier or view, view
         state, why = _state(view)
         reader, directory = self._reader, self.daemon.directory
@@ -206,15 +210,6 @@ class Watch:
                 return ()
         self._notices.extend(self._notices_reader.read()[0])
         return tuple(self._notices)
-
-    def _view(self) -> View | None:
-        if self._reader is None:
-            try:
-                self._reader = SnapshotReader(self.daemon.directory / "snapshot")
-            except SharedMemoryError:
-                return None
-        view = self._reader.read()
-        return view if view.sync_monotonic_ns else None
 
 
 def _bus(directory: Path) -> dict[str, Any]:

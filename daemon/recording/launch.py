@@ -143,7 +143,7 @@ class RecorderProcess:
     def _account(self, error: str) -> dict[str, Any]:
         """Return the account of a recorder that gave none; cycles not written count as lost."""
         settled = read_account(self.progress) or Account()
-        cycles = SnapshotReader(self._snapshot).read().counters["cycles"]
+        cycles = SnapshotReader(self._snapshot).count("cycles")
         return {
             "path": None,
             "cycles": cycles,

@@ -107,7 +107,7 @@ NO_ZEROS = Zeros(*(0.0,) * 7, 0, 0)
 
 
 class View(NamedTuple):
-    """One consistent reading."""
+    """What the snapshot held at one moment."""
 
     pid: int
     cycle: int
@@ -179,8 +179,8 @@ PAST_WORDS = 264
 LEARNED = struct.Struct(f"<7d3Q{8 * PAST_WORDS}s")
 """`Zeros`, length of the state [byte], the state."""
 ESTIMATE_SIZE = ESTIMATE.size + MOST_JOINTS * (JOINT.size + MEASURED.size)
-_PATIENCE_S = 0.05
-"""Of a reader, while the loop is in a write: many times what a preempted loop may take."""
+_PATIENCE_S, _FIRST_S = 0.05, 1.0
+"""Of a reader, while the loop is in a write: many times what a preempted loop may take; of one that has read nothing yet."""
 _PAUSE_S = 50e-6
 
 
@@ -209,13 +209,9 @@ class _Views:
         self.unconfigured = self._next("B", MAX_NODE)  # 1: restarted and not configured since
         self.node_factors = self._next("d", 4 * MAX_NODE)  # s: scaling of one that was absent at the start
         self.restarts = self._next("Q", MAX_NODE)
-        self.configured_for = self._next(
-            "Q", MAX_NODE
-        )  # s: the `restarts` after which it was last configured
+        self.configured_for = self._next("Q", MAX_NODE)  # s: its `restarts` when it was last configured
         self.doubts = self._next("B", MAX_NODE)  # s: how often it was found with a changed configuration
-        self.unchecked = self._next(
-            "B", MAX_NODE
-        )  # s: 1: as a guest, nobody has checked its identity or layout
+        self.unchecked = self._next("B", MAX_NODE)  # s: 1: nobody has checked its identity or layout
         self.learned = self._next("B", MOST_JOINTS * LEARNED.size)
         # guarded as `estimate` is, and per joint and method errors as in `errors`
         self.shadows = self._next("B", MOST_JOINTS * SHADOW.size)
@@ -245,38 +241,54 @@ class Snapshot(_Views):
         return tuple(self.node_factors[4 * node_id : 4 * node_id + 4])
 
 
+def _shadows(views: _Views, joint: int) -> dict[str, ShadowView]:
+    """Return the shadow methods of a joint, from 0 on, that are computed."""
+    values = SHADOW.unpack_from(views.shadows, joint * SHADOW.size)
+    step, count, found = len(SHADOW_QUANTITIES), len(SHADOW_METHODS), {}
+    for n, method in enumerate(SHADOW_METHODS):
+        torque, sigma, reference, age = values[step * n : step * n + step]
+        at = 3 * (count * joint + n)
+        *errors, samples = views.shadow_errors[at : at + 3]
+        rmse, now = ((each / samples) ** 0.5 if samples else nan for each in errors)
+        if not isnan(age):
+            found[method] = ShadowView(torque, sigma, reference, age, values[n - count], rmse, now)
+    return found
+
+
 class SnapshotReader:
     """Reader's side. Raises SharedMemoryError where there is nothing to read at the path, or of another layout."""
 
     def __init__(self, path: Path, *, supervisor: bool = False) -> None:
+        self._last: View | None = None
         self._memory = mapped(path, "no running loop", writable=supervisor)
         if len(self._memory) != SIZE or _HEAD.unpack_from(self._memory, 0)[0] != _MAGIC:
             raise SharedMemoryError(f"{path}: not a status snapshot of this version")
         self._views = _Views(memoryview(self._memory))
 
     def read(self) -> View:
-        """Return a consistent view; wait while the loop is writing.
+        """Return a view of one moment; wait while the loop is writing.
 
-        A loop that was killed in a write never ends it; after `_PATIENCE_S` the view is of the unfinished write.
+        Of a loop that stays in its write, preempted or killed, the last view that was read, as old as its stamps.
+        Raises SharedMemoryError where none was.
         """
-        sequence, end = self._views.sequence, 0.0
+        sequence, end_s = self._views.sequence, time.monotonic() + (_PATIENCE_S if self._last else _FIRST_S)
         while True:
-            before = sequence[0]
-            view = self._view()
+            before, content = sequence[0], self._memory[:]
             if before % 2 == 0 and before == sequence[0]:
-                return view
-            now = time.monotonic()
-            end = end or now + _PATIENCE_S
-            if now >= end:
-                return view
-            time.sleep(_PAUSE_S)  # the loop may have been preempted in its write: it needs the processor more
+                self._last = self._view(content)
+            elif time.monotonic() < end_s:
+                time.sleep(_PAUSE_S)  # a preempted loop needs the processor more
+                continue
+            elif self._last is None:
+                raise SharedMemoryError(f"the loop has been in one write for {_FIRST_S:g} s")
+            return self._last
 
-    def _view(self) -> View:
-        views = self._views
-        _, pid, period_s, worst_load, count = _HEAD.unpack_from(self._memory, 0)
+    def _view(self, content: bytes) -> View:
+        views = _Views(memoryview(content))
+        _, pid, period_s, worst_load, count = _HEAD.unpack_from(content, 0)
         block, errors = bytes(views.estimate), views.errors
         index, sync_counter, realtime_ns, monotonic_ns, *since = ESTIMATE.unpack_from(block, 0)
-        joints, first = range(count), ESTIMATE.size + MOST_JOINTS * JOINT.size
+        joints, at, first = range(count), ESTIMATE.size, ESTIMATE.size + MOST_JOINTS * JOINT.size
         inputs = (InputView._make(each) for each in INPUT.iter_unpack(views.inputs))
         learned = [LEARNED.unpack_from(views.learned, n * LEARNED.size) for n in joints]
         aligned, now = (
@@ -294,9 +306,7 @@ class SnapshotReader:
             sync_monotonic_ns=monotonic_ns,
             period_s=period_s,
             worst_load=worst_load,
-            joints=tuple(
-                JointView(*JOINT.unpack_from(block, ESTIMATE.size + n * JOINT.size)) for n in joints
-            ),
+            joints=tuple(JointView(*JOINT.unpack_from(block, at + n * JOINT.size)) for n in joints),
             measured=tuple(Measured(*MEASURED.unpack_from(block, first + n * MEASURED.size)) for n in joints),
             counters=dict(zip(COUNTERS, views.counters, strict=True)),
             rmse_nm=aligned,
@@ -310,22 +320,9 @@ class SnapshotReader:
             inputs=tuple(each for each in inputs if any(each)),
             zeros=tuple(Zeros(*each[:9]) for each in learned),
             pasts=tuple(each[10][: each[9]] for each in learned),
-            shadows=tuple(self._shadows(n) for n in joints),
+            shadows=tuple(_shadows(views, n) for n in joints),
             conflict_cob_id=views.conflict[0],
         )
-
-    def _shadows(self, joint: int) -> dict[str, ShadowView]:
-        """Return the shadow methods of a joint, from 0 on, that are computed."""
-        values = SHADOW.unpack_from(self._views.shadows, joint * SHADOW.size)
-        step, count, found = len(SHADOW_QUANTITIES), len(SHADOW_METHODS), {}
-        for n, method in enumerate(SHADOW_METHODS):
-            torque, sigma, reference, age = values[step * n : step * n + step]
-            at = 3 * (count * joint + n)
-            *errors, samples = self._views.shadow_errors[at : at + 3]
-            rmse, now = ((each / samples) ** 0.5 if samples else nan for each in errors)
-            if not isnan(age):
-                found[method] = ShadowView(torque, sigma, reference, age, values[n - count], rmse, now)
-        return found
 
     def work_us(self, *shares: float) -> list[float]:
         """Return quantiles of the work per cycle [us], upper edge of their bin (1.0: the true maximum); NaN without data."""
@@ -342,6 +339,10 @@ class SnapshotReader:
     def late_bins(self) -> tuple[int, ...]:
         """Return the histogram of the SYNC's lateness: cycles in each bin of `LATE_BIN_NS`."""
         return tuple(self._views.late)
+
+    def count(self, name: str) -> int:
+        """Return a counter as it stands: one word, whatever the loop is writing."""
+        return int(self._views.counters[word_of(name)])
 
     @property
     def resets_done(self) -> int:

@@ -193,6 +193,15 @@ def test_the_live_view_on_a_terminal_outlives_its_daemon_and_ends_by_ctrl_c(tmp_
     os.close(terminal)
 
 
+def test_a_loop_that_died_in_its_first_write_stands_still_and_is_not_shown(tmp_path: Path) -> None:
+    daemon = running(tmp_path)
+    SnapshotReader(daemon.directory / "snapshot", supervisor=True)._views.sequence[0] = 1
+    found = Watch(daemon).read()
+    assert (found.state, found.view) == ("still", None)
+    assert "not read" in found.why
+    assert "in one write" in picture(daemon, 80)
+
+
 def test_no_line_is_dropped_on_a_small_terminal(tmp_path: Path) -> None:
     """All pages together hold every line of the picture, each fits, and the line below states how many there are."""
     console = Console(file=io.StringIO(), width=80, height=24, force_terminal=True)

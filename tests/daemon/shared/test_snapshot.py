@@ -177,9 +177,19 @@ def test_a_reader_waits_for_a_loop_that_was_preempted_in_its_write(tmp_path: Pat
     assert (view.cycle, view.counters["bits_worst_case"]) == (2, 2)
 
 
-def test_what_a_loop_left_that_died_in_its_write_can_be_read(tmp_path: Path) -> None:
+def test_a_loop_that_stays_in_its_write_gives_no_view_of_two_moments(tmp_path: Path) -> None:
+    """It died between counters and estimate: what was read before is as old as it says, a new reader has nothing."""
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.5)
     estimate = EstimateWriter(snapshot)
     estimate.write(7, 1, 1, (ONE, TWO))
+    reader = SnapshotReader(tmp_path / "s")
+    whole = reader.read()
     estimate.begin()
-    assert SnapshotReader(tmp_path / "s").read().cycle == 7
+    snapshot.counters[COUNTERS.index("cycles")] = 15
+    assert reader.read() == whole
+    assert (whole.cycle, whole.counters["cycles"], reader.count("cycles")) == (7, 0, 15)
+    with pytest.raises(SharedMemoryError, match="in one write for 1 s"):
+        SnapshotReader(tmp_path / "s").read()
+    estimate.write(15, 1, 1, (ONE, TWO))
+    view = reader.read()
+    assert (view.cycle, view.counters["cycles"]) == (15, 15)
