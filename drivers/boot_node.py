@@ -31,6 +31,7 @@ from jtqd.drivers.drive import (
     select_tpdos,
     tpdos_as_json,
 )
+from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.own_objects import JTQD_NODE
 from jtqd.drivers.pdo import (
     ACYCLIC,
@@ -127,7 +128,7 @@ class NodeObjects:
         """Upload an object that nothing depends on; None where the device gives none, for whatever reason."""
         try:
             return self.access.read(*key)
-        except (SdoAbort, SdoTimeout):
+        except (SdoAbort, SdoTimeout, EdsError):
             return None
 
     def optional_number(self, key: Key, size: int, letter: str = "") -> int | None:
@@ -453,13 +454,15 @@ class TpdoSetup:
         objects = NodeObjects(self._objects.access, self._profile.node_id)  # values that are not in force
         for tpdo in read_tpdos(lambda key: objects.optional_number(key, 4)):
             try:
+                if tpdo.fault:
+                    raise PdoError(tpdo.fault)
                 if only_valid and not tpdo.on:
                     raise PdoError("it is switched off (bit 31 of its COB-ID)")
                 if tpdo.extended:
                     raise PdoError(f"TPDO{tpdo.number} has a 29-bit COB-ID")
                 maps.append(self._map_of(tpdo))
             except PdoError as error:
-                if tpdo.words:
+                if tpdo.words or tpdo.fault:
                     unusable.append(f"TPDO{tpdo.number}: {error}")
         return maps, unusable
 

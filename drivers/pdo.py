@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from jtqd.drivers.frame import CAN_EFF_MASK
-from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.object_dictionary import EdsError, ObjectStore
 from jtqd.drivers.sdo import DEVICE_STATE, NOT_MAPPABLE, PDO_TOO_LONG, VALUE_RANGE, Key, SdoAbort, label
 
 MAX_PDO_BYTES = 8
@@ -147,6 +147,7 @@ class Tpdo:
         extended: its COB-ID has 29 bits.
         timer_ms: its event timer (1800h:5); 0: none, or not read.
         mapping_fixed, type_fixed: by its EDS they cannot be written; on a bus this is not known.
+        fault: why its EDS cannot be read there; it is then as if switched off.
     """
 
     number: int
@@ -158,6 +159,7 @@ class Tpdo:
     timer_ms: int = 0
     mapping_fixed: bool = False
     type_fixed: bool = False
+    fault: str = ""
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -170,11 +172,16 @@ def read_tpdos(number_of: Callable[[Key], int | None]) -> list[Tpdo]:
     found = []
     for number in range(1, TPDO_COUNT + 1):
         communication, mapping = tpdo_parameters(number)
-        cob_id = number_of((communication, 1))
-        if cob_id is None:
+        try:
+            cob_id = number_of((communication, 1))
+            if cob_id is None:
+                continue
+            kind, count = ((number_of(key) or 0) & 0xFF for key in ((communication, 2), (mapping, 0)))
+            subs = range(1, min(count, 8 * MAX_PDO_BYTES) + 1)
+            words = tuple(number_of((mapping, sub)) or 0 for sub in subs)
+        except EdsError as error:
+            found.append(Tpdo(number, 0, (), on=False, fault=str(error)))
             continue
-        kind, count = ((number_of(key) or 0) & 0xFF for key in ((communication, 2), (mapping, 0)))
-        words = tuple(number_of((mapping, sub)) or 0 for sub in range(1, min(count, 8 * MAX_PDO_BYTES) + 1))
         extended = bool(cob_id & EXTENDED)
         identifier = cob_id & (CAN_EFF_MASK if extended else CAN_ID)
         found.append(Tpdo(number, identifier, words, kind, not cob_id & INVALID, extended))

@@ -21,7 +21,7 @@ DRIVE_EDS, SENSOR_EDS = EDS / "drive.eds", EDS / "torque_sensor.eds"
 
 def without(*keys, eds=DRIVE_EDS, node=5):
     return ObjectStore(
-        [each for each in read_eds(eds, node) if (each.index, each.subindex) not in keys], node
+        [each for each in read_eds(eds, node).entries if (each.index, each.subindex) not in keys], node
     )
 
 
