@@ -75,7 +75,7 @@ class Survey:
         unmappable: objects that cannot be mapped by its EDS; empty when read on a bus, where this is not known.
         defaults: the numbers are defaults; the device itself may have others.
         tpdos: as they are configured, where they were read.
-        notes: of its EDS, what cannot be read.
+        eds_notes: what cannot be read of its EDS.
     """
 
     node: int
@@ -87,7 +87,12 @@ class Survey:
     unmappable: frozenset[Key] = frozenset()
     defaults: bool = False
     tpdos: tuple[Tpdo, ...] = ()
-    notes: tuple[str, ...] = ()
+    eds_notes: tuple[str, ...] = ()
+
+    @property
+    def notes(self) -> list[str]:
+        """What is odd in its EDS or its mapping, and is used as far as it can be."""
+        return [*self.eds_notes, *(f"node {self.node}: {each.note}" for each in self.tpdos if each.note)]
 
     @property
     def title(self) -> str:
@@ -196,7 +201,7 @@ def survey_of_eds(path: Path, node: int, more: Iterable[Key] = ()) -> Survey:
         tpdos=tuple(
             _fixed_by(each, entries) for each in _tpdos(lambda key: number(key) if key in entries else None)
         ),
-        notes=eds.notes,
+        eds_notes=eds.notes,
     )
 
 
@@ -253,7 +258,9 @@ class BusSurvey:
         try:
             with self._access(node) as access:
                 return survey(access, node)
-        except SdoTimeout:
+        except SdoTimeout as silence:
+            if silence.refused:
+                raise SurveyError(f"node {node}: {silence}") from None
             return None
 
     def numbers(self, node: int, keys: Iterable[Key]) -> dict[Key, int]:

@@ -290,10 +290,11 @@ def _devices(options: argparse.Namespace) -> _Devices:
         if path is not None:
             eds = eds_survey(path, node, options.profile)
             surveys[node] = merged(eds, surveys.get(node), path)
-            notes += [f"node {node}: {description(eds)}", *(each for each in eds.notes if each not in notes)]
+            notes.append(f"node {node}: {description(eds)}")
     if sensor and options.bus is not None and not heard and sensor not in surveys:
         raise UsageError(f"--sensor: node {sensor} does not answer on {options.bus}{_others(surveys)}")
     _check_profiles(nodes, sensor, surveys)
+    notes += dict.fromkeys(note for each in surveys.values() for note in each.notes)
     notes += [
         f"node {node}: profile {family.name} ({family.title})"
         for node in nodes

@@ -191,7 +191,7 @@ def content(survey: Survey, problems: list[str], family: Family | None = None) -
         "missing": [label(*key) for key in sorted(survey.missing)],
         "unmappable": [label(*key) for key in sorted(survey.unmappable)],
         "tpdos": tpdos,
-        "notes": list(survey.notes),
+        "notes": survey.notes,
         "problems": problems,
         "family": None if family is None else family.name,
     }

@@ -238,7 +238,7 @@ def test_a_value_in_use_goes_before_a_default_and_another_node_is_told(tmp_path)
     found = survey_of_eds(path, 5)
     assert found.numbers[0x6091, 1] == 120
     assert found.source == "values of maker.eds"
-    assert found.notes == (f"{path}: of node 11 by its NodeID, read for node 5",)
+    assert found.notes == [f"{path}: of node 11 by its NodeID, read for node 5"]
 
 
 @pytest.mark.parametrize(
