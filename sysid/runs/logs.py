@@ -164,7 +164,8 @@ def _joints_of(log: Path | Sequence[Path], name: Path) -> list[int]:
     """Return the numbers of the joints of a log; LogError where there is none."""
     there = sorted(int(found[1]) for found in map(_TOPIC.fullmatch, topics_of(log)) if found)
     if not there:
-        raise LogError(f"{name}: found no message on /joint/1/state, expected one per cycle")
+        others = f" ({', '.join(sorted(topics_of(log)))}: `jtq export csv --topic` makes a table of one)"
+        raise LogError(f"{name}: found no message on /joint/1/state, expected one per cycle{others}")
     return there
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.runs import column_names as of
 from jtqd.sysid.runs.column_names import COUNTS, Name, quoted, read_name
+from jtqd.sysid.runs.tables import interleaved
 
 Table = Mapping[str, FloatArray]
 """Columns [n] of one file by name; NaN: a blank cell."""
@@ -185,7 +186,8 @@ def propose(tables: Sequence[Table]) -> Proposal:
         )
     joints = [_Joint(n, [x for x in columns if x.used and x.joint == n], seconds) for n in numbers]
     proposals = tuple(each.proposal() for each in joints)
-    _check_together([each for each in columns if each.target])
+    if why := interleaved({each.column: np.isfinite(each.values) for each in columns if each.target}):
+        raise ProposalError(why)
     steps = np.diff(seconds[np.isfinite(seconds)])
     return Proposal(tuple(guesses), time, 1.0 / float(np.median(steps[steps > 0.0])), proposals)
 
@@ -283,18 +285,6 @@ def _set_joints(guesses: Sequence[Guess]) -> None:
             each.joint = number + first
             if not 1 <= each.joint <= 7:
                 each.drop("joints above 7 are not read")
-
-
-def _check_together(used: Sequence[Guess]) -> None:
-    """Refuse columns that are never filled in the same row. Raises ProposalError."""
-    filled = [(each, np.isfinite(each.values)) for each in used]
-    for k, (one, rows) in enumerate(filled):
-        for two, others in filled[k + 1 :]:
-            if np.count_nonzero(rows & others) < 0.01 * min(rows.sum(), others.sum()):
-                raise ProposalError(
-                    f"found columns {one.column!r} and {two.column!r} never filled in the same row: topics with "
-                    "stamps of their own, expected one time base (resample one onto the stamps of the other)"
-                )
 
 
 class _Joint:

@@ -1,7 +1,7 @@
 """Run tables as files: CSV, gzipped CSV and Parquet are read, CSV and gzipped CSV are written.
 
-A table has one header row, UTF-8, cells between commas, semicolons or tabs; lines of comment (#) may stand above it. Its
-numbers have decimal points, or all of them decimal commas.
+A table has one header row, UTF-8, cells between commas, semicolons or tabs; lines of comment (#, %, //) may stand anywhere.
+Its numbers have decimal points, or all of them decimal commas.
 pyarrow is imported when a Parquet file is read.
 The true torques of an emulated run, which no instrument measures, are NAME.truth.npz beside NAME.csv.gz.
 """
@@ -18,12 +18,13 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain, combinations, islice
 from pathlib import Path
 from typing import Any, Final
 from zipfile import BadZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.files import whole_file, write_whole
@@ -32,8 +33,9 @@ from jtqd.estimator.text import counted
 from jtqd.sysid.runs.column_map import NO_COLUMN, TIME, ColumnMap, Expression, ExpressionError
 from jtqd.sysid.runs.run_file import Content, NoColumnError, RunError, file_bytes, header_place
 
-_BLANK: Final = ("", "nan", "-nan", "nan(ind)", "-nan(ind)", "null", "none", "na", "n/a")
-"""What recorders write for no value, in lower case."""
+_BLANK: Final = ("", "nan", "nan(ind)", "nan(snan)", "1.#ind", "1.#qnan", "null", "none", "na", "n/a", "#n/a")
+"""What recorders write for no value, in lower case and without a sign."""
+_COMMENT: Final = ("#", "%", "//")
 
 
 def read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> Content:
@@ -47,7 +49,7 @@ def read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> 
     for line, row in rows:
         for name, index in source.items():
             value = number(row[index])
-            if not math.isfinite(value) and not (blanks and row[index].strip().lower() in _BLANK):
+            if not math.isfinite(value) and not (blanks and _is_blank(row[index])):
                 mark = "comma" if number is _comma_number else "point" if "," in row[index] else ""
                 raise RunError(
                     f"{path}: line {line}, column {name!r}: found {row[index][:40]!r}, expected a finite number"
@@ -81,7 +83,7 @@ def read_columns(path: Path) -> tuple[dict[str, FloatArray], dict[str, str]]:
     for name, column in cells.items():
         shown = ["" if cell is None else str(cell).strip() for cell in column]
         values = np.array([number(cell) for cell in shown])
-        wrong = next((k for k in np.flatnonzero(np.isnan(values)) if shown[k].lower() not in _BLANK), None)
+        wrong = next((k for k in np.flatnonzero(np.isnan(values)) if not _is_blank(shown[k])), None)
         if wrong is None:
             numbers[name] = values
         else:
@@ -184,6 +186,8 @@ class _Wanted:
             which = ", ".join(f"{name!r} in {rows}" for name, rows in count.items())
             rows = counted(len(keep), "row")
             found.append(f"{int((~keep).sum())} of {rows} left out for a blank cell ({which})")
+            if why := interleaved({name: ~blank[name] for name in names}):
+                raise RunError(f"{self.path}: {why}")
             if np.count_nonzero(keep) < 2:
                 kept = counted(int(keep.sum()), "sample")
                 raise RunError(f"{self.path}: {found[-1]}: found {kept}, expected at least 2")
@@ -197,6 +201,18 @@ class _Wanted:
                 for key, each in used.items()
             }
         return Content(self.path, source, sha256, values, lines, (*notes, *found), self.columns)
+
+
+def interleaved(filled: Mapping[str, NDArray[np.bool_]]) -> str:
+    """Return which columns [n] are not filled in the same rows; "" for none."""
+    for one, two in combinations(filled, 2):
+        rows, others = filled[one], filled[two]
+        if 2 * np.count_nonzero(rows & others) < min(np.count_nonzero(rows), np.count_nonzero(others)):
+            return (
+                f"found columns {one!r} and {two!r} filled in different rows: topics with stamps of their own, expected one "
+                "time base (resample one onto the stamps of the other)"
+            )
+    return ""
 
 
 def _names(expressions: Mapping[str, Expression]) -> list[str]:
@@ -232,7 +248,7 @@ def _table(
     header = [name.strip() for name in names]
     counting = header == [str(k) for k in range(len(header))]  # names that some libraries give
     if header and not counting and all(math.isfinite(_number(name)) for name in header):
-        last = above[-1].lstrip("# \t") if above else ""
+        last = above[-1].lstrip("#%/ \t") if above else ""
         named = [name.strip() for name in last.split(separator)]
         if len(named) != len(header) or not any(named):
             raise RunError(
@@ -253,12 +269,13 @@ def _table(
 
     def whole() -> Iterator[tuple[int, list[str]]]:
         for place, row in chain(first, rows):
-            if row and len(row) != len(header):
+            if not row or (row[0].lstrip().startswith(_COMMENT) and not _is_blank(row[0])):
+                continue
+            if len(row) != len(header):
                 raise RunError(
                     f"{path}: line {place + len(above)}: found {counted(len(row), 'cell')}, expected {len(header)}"
                 )
-            if row:
-                yield place + len(above), row
+            yield place + len(above), row
 
     return header, whole(), notes, number
 
@@ -266,10 +283,14 @@ def _table(
 def _comments(text: str) -> tuple[list[str], str]:
     """Return the lines of comment and the blank lines above the header, and the text below them."""
     above: list[str] = []
-    while text.startswith("#") or (text and not text.split("\n", 1)[0].strip()):
+    while text.startswith(_COMMENT) or (text and not text.split("\n", 1)[0].strip()):
         line, _, text = text.partition("\n")
         above.append(line.strip())
     return above, text
+
+
+def _is_blank(cell: str) -> bool:
+    return cell.strip().lower().lstrip("+-") in _BLANK
 
 
 def _number(cell: str) -> float:

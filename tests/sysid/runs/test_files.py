@@ -625,13 +625,70 @@ def test_a_table_of_all_cycles_is_the_same_run_without_its_blank_cells(tmp_path)
     [
         "# recorded 2026-01-01\n\n# rig 3\n" + GOOD,
         "# rig 3\n# " + GOOD,
-        GOOD + "0.003,-nan(ind),-5\n0.004,3.5,N/A\n",
+        "% rig 3\n% " + GOOD,
+        "// rig 3\n//" + GOOD,
+        GOOD.replace("\n", "\n# under way\n"),
+        GOOD.replace("\n", "\n// a, remark, more, of it\n"),
+        GOOD + "% end of the recording",
+        *(
+            GOOD + f"0.003,{word},-5\n0.004,3.5,{word}\n"
+            for word in (
+                "nan",
+                "-nan(ind)",
+                "nan(ind)",
+                "-1.#IND",
+                "1.#QNAN",
+                "-nan(snan)",
+                "N/A",
+                "#N/A",
+                "+NaN",
+            )
+        ),
+        GOOD + "#N/A,1.5,-5\n",
     ],
 )
-def test_comments_above_the_header_and_words_for_a_blank_cell(tmp_path, text):
+def test_comments_and_words_for_a_blank_cell(tmp_path, text):
     [run] = read_runs([_file(tmp_path, text)], segments=True)
     assert run.table.time_s.tolist() == [0.0, 0.001, 0.002]
     assert column(run.table, "torque_nm").tolist() == [-2.0, -3.0, -4.0]
+
+
+def _interleaved(rows, values, first="t,q,i"):
+    """A table of two topics; `values`: which of them each row has, in turn."""
+    cells = {"q": "{0},", "i": ",{0}", "both": "{0},{0}", "": ","}
+    lines = [f"{n / 1000:.3f},{cells[values[n % len(values)]].format(n % 7)}" for n in range(rows)]
+    return "\n".join([first, *lines]) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("values", "interleaved"),
+    [
+        (["q", "i"], True),
+        (["q", "q", "i"], True),
+        (["q", "i", "", "i"], True),
+        ([*["q", "i"] * 10, "both"], True),
+        (["both", "i"], False),  # one topic at half the rate, on the stamps of the other
+        (["both", "i", "i", "i", "i", "i"], False),
+        ([*["both"] * 2000, "q", "i"], False),
+    ],
+)
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_topics_with_stamps_of_their_own_are_told(tmp_path, values, interleaved, ending):
+    path = _file(tmp_path, _interleaved(6000, values))
+    if ending == "parquet":
+        pytest.importorskip("pyarrow")
+        from pyarrow import csv, parquet
+
+        parquet.write_table(csv.read_csv(path), tmp_path / "a.parquet")
+        path = tmp_path / "a.parquet"
+    columns = _map(time_s="t", j1__current_a="i", j1__motor_position_rad="q")
+    if not interleaved:
+        notes = read_runs([path], columns, segments=True)[0].notes
+        assert "rows left out for a blank cell" in notes[0]
+        return
+    words = r": found columns '[qi]' and '[qi]' filled in different rows: topics with stamps of their own"
+    with pytest.raises(RunError, match=words):
+        read_runs([path], columns, segments=True)
 
 
 def test_lines_are_counted_with_the_comments(tmp_path):

@@ -274,7 +274,7 @@ def test_one_number_makes_no_joint():
                 "pos": np.where(np.arange(len(T)) % 2, Q, math.nan),
                 "cur": np.where(np.arange(len(T)) % 2, math.nan, CURRENT),
             },
-            "never filled in the same row",
+            "'pos' and 'cur' filled in different rows",
         ),
     ],
 )
