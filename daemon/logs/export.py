@@ -11,6 +11,7 @@ import csv
 import gzip
 import io
 import json
+import math
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -25,11 +26,11 @@ from jtqd.daemon.logs.read import (
     ERROR,
     EXTENDED,
     REMOTE,
-    Frames,
     Logs,
     Records,
     can_topics,
-    iter_frames,
+    interface_of,
+    iter_bus,
     iter_messages,
     iter_topics,
     log_parts,
@@ -65,11 +66,15 @@ def parser() -> argparse.ArgumentParser:
     add("what", choices=("csv", "parquet", "candump", "dbc"))
     add("logs", nargs="*", type=Path, metavar="LOG", help="parts of one run, or their directory")
     add("--out", type=Path, metavar="FILE", help="default: standard output (candump and dbc only)")
-    add("--topic", metavar="TOPIC", help="csv, parquet: this topic's fields; candump: its frames")
+    add(
+        "--topic",
+        metavar="TOPIC",
+        help="csv, parquet: this topic's fields; candump: its frames (default: of all)",
+    )
     add("--start", type=_seconds, metavar="S", help="seconds from the first message on")
     add("--end", type=_seconds, metavar="S", help="up to this time (excluded)")
     add("--all-cycles", action="store_true", help="run table: keep cycles with missing values (NaN)")
-    add("--interface", default="can0", help="name in candump's lines (default can0)")
+    add("--interface", help="name in candump's lines (default: as in the log, else can0)")
     add("--config", type=Path, metavar="FILE", help="dbc: of a configuration instead of a log")
     add("--json", action="store_true", help="result as JSON on standard output")
     return result
@@ -178,13 +183,15 @@ def _named(path: Logs) -> str:
 
 def _candump(logs: Logs, options: argparse.Namespace, span: dict[str, int]) -> dict[str, Any]:
     topics = can_topics(logs)
-    topic = options.topic or topics[0]
-    _one_of(logs, topics, topic, "frames on")
+    if options.topic is not None:
+        _one_of(logs, topics, options.topic, "frames on")
+        topics = [options.topic]
     frames = 0
     with nullcontext(sys.stdout.buffer) if options.out is None else _table_file(options.out) as file:
-        for part in iter_frames(logs, topic, **span):
-            file.write("".join(line + "\n" for line in candump_lines(part, options.interface)).encode())
-            frames += len(part.ids)
+        for topic, *frame in iter_bus(logs, topics, **span):
+            line = candump_line(frame, options.interface or interface_of(topic) or "can0")
+            file.write(f"{line}\n".encode())
+            frames += 1
     return ({} if options.out is None else {"path": str(options.out)}) | {"frames": frames}
 
 
@@ -222,13 +229,13 @@ def _dbc_of_configuration(path: Path) -> str:
         raise LogError(str(error)) from None
 
 
-def candump_lines(frames: Frames, interface: str) -> Iterator[str]:
-    """Yield frames as lines of `candump -L`, without their ends: `(1700000000.000000) can0 181#0011223344556677`."""
-    for stamp, can_id, length, data in frames.rows():
-        seconds, rest = divmod(stamp, 1_000_000_000)
-        number = f"{can_id & 0x3FFFFFFF:08X}" if can_id & (EXTENDED | ERROR) else f"{can_id & 0x7FF:03X}"
-        content = f"R{length or ''}" if can_id & REMOTE else data.hex().upper()
-        yield f"({seconds}.{rest // 1000:06d}) {interface} {number}#{content}"
+def candump_line(frame: Sequence[Any], interface: str) -> str:
+    """Return a frame (stamp [ns], identifier, length, data) as `candump -L` does: `(1700000000.000000) can0 181#0011`."""
+    stamp_ns, can_id, length, data = frame
+    seconds, micros = divmod((stamp_ns + 500) // 1000, 1_000_000)
+    number = f"{can_id & 0x3FFFFFFF:08X}" if can_id & (EXTENDED | ERROR) else f"{can_id & 0x7FF:03X}"
+    content = f"R{length or ''}" if can_id & REMOTE else data.hex().upper()
+    return f"({seconds}.{micros:06d}) {interface} {number}#{content}"
 
 
 # ---- tables ----
@@ -371,53 +378,86 @@ def topic_blocks(
 ) -> Iterator[Columns]:
     """Yield all fields of a topic as columns, chunk by chunk: `log_time_ns`, then every field by its path.
 
-    A path is such as `header.stamp.sec`. Fixed arrays have one column for each element (`data[3]`). A sequence is one
-    column of its values as text.
+    A path is such as `header.stamp.sec`. Arrays and sequences have one column for each element (`data[3]`), blank where a
+    message has fewer; a sequence of more than 256 elements is one column of its values as text.
     """
+    span = {"start_ns": start_ns, "end_ns": end_ns}
+    kinds: dict[str, list[np.dtype[Any]]] = {}
+    blocks = 0
+    for messages in iter_messages(path, topic, start_ns=start_ns, end_ns=end_ns):
+        if messages.records.dtype != object:  # a schema with fixed rows has no sequence
+            break
+        blocks += 1
+        for name, values in _flat(messages.records).items():
+            kinds.setdefault(name, []).append(values.dtype)
+    absent = [np.dtype(float)]
+    kind = {name: np.result_type(*each, *absent * (len(each) < blocks)) for name, each in kinds.items()}
     found = False
     for messages in iter_messages(path, topic, start_ns=start_ns, end_ns=end_ns):
-        columns: Columns = {"log_time_ns": messages.log_times}
-        _flatten("", messages.records, columns)
+        columns = _flat(messages.records)
+        for name, each in kind.items():
+            if name not in columns:
+                columns[name] = np.full(len(messages.records), "" if each.kind == "O" else np.nan, each)
+            columns[name] = columns[name].astype(each, copy=False)
         found = True
-        yield columns
+        yield {"log_time_ns": messages.log_times, **{name: columns[name] for name in kind or columns}}
     if not found:
-        when = _when({"start_ns": start_ns, "end_ns": end_ns})
-        raise LogError(f"{_named(path)}: found no message on {topic}{when}, expected one at least")
+        raise LogError(f"{_named(path)}: found no message on {topic}{_when(span)}, expected one at least")
+
+
+_LONGEST = 256
+
+
+def _flat(records: Records) -> Columns:
+    """Return the fields of messages as columns."""
+    columns: Columns = {}
+    if records.dtype == object:
+        _flatten_objects("", records.tolist(), columns)
+    else:
+        _flatten("", records, columns)
+    return columns
 
 
 def _flatten(prefix: str, values: NDArray[Any], columns: Columns) -> None:
-    """Put the fields below `prefix` into columns; of the decoder's objects the attributes, a sequence as text."""
+    """Put the fields below `prefix` into columns."""
     kind = values.dtype
-    below = f"{prefix}." if prefix else ""
     if kind.names is not None:
         for name in kind.names:
-            _flatten(below + name, values[name], columns)
+            _flatten(f"{prefix}.{name}".lstrip("."), values[name], columns)
     elif values.ndim > 1:
         for n in range(values.shape[1]):
             _flatten(f"{prefix}[{n}]", values[:, n], columns)
     elif kind.kind == "S":
         columns[prefix] = np.array([each.decode("utf-8", "replace") for each in values.tolist()], object)
-    elif kind.kind != "O":
-        columns[prefix] = values
-    elif hasattr(values[0], "__slots__"):
-        for name in values[0].__slots__:
-            inner = np.empty(len(values), object)
-            inner[:] = [getattr(each, name) for each in values]
-            _flatten(below + name, inner, columns)
-    elif isinstance(values[0], int | float):
-        columns[prefix] = np.array(values.tolist())
     else:
-        columns[prefix] = np.array([_as_text(each) for each in values], object)
+        columns[prefix] = values
 
 
-def _as_text(value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    if hasattr(value, "__slots__"):
-        return " ".join(f"{name}={_as_text(getattr(value, name))}" for name in value.__slots__)
-    if isinstance(value, Iterable):
-        return " ".join(map(_as_text, value))
-    return repr(value) if isinstance(value, float) else str(value)
+def _flatten_objects(prefix: str, values: list[Any], columns: Columns) -> None:
+    """Put the attributes of the decoder's objects into columns as `_flatten` does; None: an element that is not there."""
+    one: Any = next((each for each in values if each is not None), None)
+    if hasattr(one, "__slots__"):
+        for name in one.__slots__:
+            inner = [getattr(each, name, None) for each in values]
+            _flatten_objects(f"{prefix}.{name}".lstrip("."), inner, columns)
+    elif isinstance(one, Sequence) and not isinstance(one, str):
+        rows: list[Any] = [() if each is None else each for each in values]
+        longest = max(map(len, rows))
+        element: Any = next((row[0] for row in rows if len(row)), None)
+        if hasattr(element, "__slots__"):
+            for name in element.__slots__:
+                inner = [[getattr(each, name) for each in row] for row in rows]
+                _flatten_objects(f"{prefix}.{name}", inner, columns)
+        elif longest > _LONGEST:
+            columns[prefix] = np.array([" ".join(map(str, row)) for row in rows], object)
+        else:
+            for n in range(longest):
+                inner = [row[n] if n < len(row) else None for row in rows]
+                _flatten_objects(f"{prefix}[{n}]", inner, columns)
+    elif isinstance(one, int | float):
+        columns[prefix] = np.array([math.nan if each is None else each for each in values])
+    else:
+        columns[prefix] = np.array(["" if each is None else str(each) for each in values], object)
 
 
 # ---- files ----

@@ -7,10 +7,12 @@ equal form are copied as rows, without a loop. Messages with sequences, or texts
 
 from __future__ import annotations
 
+import heapq
 import re
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +21,7 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from jtqd.daemon.logs.log_file import MESSAGE_HEAD, Batch, LogError, LogFile, pieces
-from jtqd.daemon.recording.messages import FRAMES_NAMES
+from jtqd.daemon.recording.messages import CAN_FRAMES, FRAMES_NAMES
 from jtqd.daemon.recording.run_files import ACTIVE, PART_PATTERN
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.status import DEGRADED, VALID
@@ -577,6 +579,27 @@ def iter_frames(
         lengths = np.minimum(frames["length"][present], 8).astype(np.uint8)
         data = np.where(np.arange(8) < lengths[:, None], frames["data"][present], 0).astype(np.uint8)
         yield Frames(stamps[present], frames["id"][present], lengths, data)
+
+
+def iter_bus(
+    path: Logs, topics: Sequence[str], *, start_ns: int | None = None, end_ns: int | None = None
+) -> Iterator[tuple[str, int, int, int, bytes]]:
+    """Yield topic, stamp [ns], identifier, length and data of each frame of these topics by their stamps.
+
+    Raises LogError, OSError.
+    """
+
+    def frames_of(topic: str) -> Iterator[tuple[str, int, int, int, bytes]]:
+        for frames in iter_frames(path, topic, start_ns=start_ns, end_ns=end_ns):
+            for row in frames.rows():
+                yield topic, *row
+
+    return heapq.merge(*map(frames_of, topics), key=itemgetter(1))
+
+
+def interface_of(topic: str) -> str:
+    """Return the name of the interface whose frames a topic has: can1 of /can1/frames; "" for that of jtqd's own frames."""
+    return "" if topic == CAN_FRAMES.name else topic.removesuffix("/frames").strip("/")
 
 
 # ---- the estimate on the bus, and the torque sensor ----

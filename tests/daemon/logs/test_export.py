@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from jtqd.daemon.logs import LogError, read_topic
+from jtqd.daemon.logs import LogError, read_topic, topics_of
 from jtqd.daemon.logs.can_io import McapCanReader, McapCanWriter
 from jtqd.daemon.logs.export import RunTable, main
 from jtqd.daemon.logs.recover import recover
@@ -139,8 +139,8 @@ def test_every_field_of_a_topic(log, tmp_path):
     assert table["stamps_ns[0]"].type == "int64"
     assert main(["csv", str(log), "--topic", "/joint_states", "--out", str(tmp_path / "s.csv")]) == 0
     first = next(csv.DictReader((tmp_path / "s.csv").open()))
-    assert first["name"] == "a b"
-    assert len(first["position"].split()) == 2
+    assert (first["name[0]"], first["name[1]"]) == ("a", "b")
+    assert {"position[0]", "position[1]"} < first.keys()
 
 
 def test_span_in_seconds(log, tmp_path, capsys):
@@ -213,6 +213,47 @@ def test_can_logconvert_there_and_back(log, tmp_path, suffix, monkeypatch):
     assert [frame[1:] for frame in found] == [frame[1:] for frame in expected]
     first = found[0][0] - expected[0][0] if suffix == "asc" else 0  # its time is relative
     assert all(abs(f[0] - e[0] - first) <= 1000 for f, e in zip(found, expected, strict=True))
+
+
+CANDUMP = """(1700000000.000999) can0 181#E803
+(1700000000.001001) can1 181#E903
+(1700000000.001002) can0 080#
+(1700000000.123457) vcan-2.a 1ABCDEF0#12345678
+(1700000001.999999) can1 701#05
+(1700000002.000000) can0 123#R4
+"""
+
+
+@pytest.mark.parametrize("names", [("can0", "can1", "vcan-2.a"), ("can0",), ("slcan7",)])
+def test_a_log_of_several_interfaces_comes_back_to_the_microsecond(tmp_path, capsys, monkeypatch, names):
+    """candump -> python-can -> MCAP -> candump: the same text, in the same order."""
+    lines = [line for line in CANDUMP.splitlines() if line.split()[1] in names] or [
+        line.replace("can0", names[0]) for line in CANDUMP.splitlines() if " can0 " in line
+    ]
+    (tmp_path / "a.log").write_text("\n".join(lines) + "\n")
+    monkeypatch.setattr(sys, "argv", ["can_logconvert", str(tmp_path / "a.log"), str(tmp_path / "b.mcap")])
+    can.logconvert.main()
+    capsys.readouterr()
+    assert sorted(topics_of(tmp_path / "b.mcap")) == sorted(f"/{name}/frames" for name in names)
+    assert main(["candump", str(tmp_path / "b.mcap")]) == 0
+    assert capsys.readouterr().out.splitlines() == lines
+    assert (
+        main(["candump", str(tmp_path / "b.mcap"), "--topic", f"/{names[0]}/frames", "--interface", "x"]) == 0
+    )
+    one = [line.replace(f" {names[0]} ", " x ") for line in lines if f" {names[0]} " in line]
+    assert capsys.readouterr().out.splitlines() == one
+    assert [each.channel for each in McapCanReader(tmp_path / "b.mcap")] == [
+        line.split()[1] for line in lines
+    ]
+
+
+def test_microseconds_are_rounded(tmp_path, capsys):
+    """As every other writer does; a stamp of the kernel has nanoseconds."""
+    cycle = Cycle(1, 1_999_999_500, (Joint(), Joint()), [(0x181, b"")])
+    log = write_log(tmp_path / "a.mcap", [cycle])
+    assert main(["candump", str(log)]) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.endswith(".000000) can0 181#")
 
 
 def test_every_kind_of_frame_comes_back(tmp_path):
@@ -341,7 +382,7 @@ def test_nothing_is_left_of_a_table_that_could_not_be_written(log, tmp_path, mon
 
 
 def test_a_topic_whose_columns_change_on_the_way(tmp_path):
-    """Sequences of one length in each chunk, of another in the next: one column of text, as in one piece."""
+    """Sequences of one length in each chunk, of another in the next: as many columns as the longest has."""
     path, out = tmp_path / "a.mcap", tmp_path / "a.csv"
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=100)
@@ -355,7 +396,94 @@ def test_a_topic_whose_columns_change_on_the_way(tmp_path):
         writer.finish()
     assert main(["csv", str(path), "--topic", "/t", "--out", str(out)]) == 0
     rows = list(csv.DictReader(out.open()))
-    assert [row["a"] for row in rows] == [*map(str, range(6)), *(f"{n} {n + 1}" for n in range(6, 12))]
+    assert [row["a[0]"] for row in rows] == [*map(str, range(12))]
+    assert [row["a[1]"] for row in rows] == [*[""] * 6, *(f"{n}.0" for n in range(7, 13))]
+
+
+NESTED = """a/Arm[] arms
+================================================================================
+MSG: a/Arm
+string name
+a/Joint[] joints
+================================================================================
+MSG: a/Joint
+float64 position
+uint8[2] flags
+"""
+SEQUENCES = {
+    "of numbers": (
+        "float64[] position\nint64[] count\n",
+        [{"position": [1.5, 2.0], "count": [1]}, {"position": [3.0, 4.5], "count": [2]}],
+        {"position[0]": [1.5, 3.0], "position[1]": [2.0, 4.5], "count[0]": [1, 2]},
+    ),
+    "of texts and flags": (
+        "string[] name\nbool[] on\n",
+        [{"name": ["a", "b"], "on": [True]}, {"name": ["b"], "on": [False]}],
+        {"name[0]": ["a", "b"], "name[1]": ["b", ""], "on[0]": [True, False]},
+    ),
+    "shorter, and empty at first": (
+        "float64[] effort\nint32[] count\n",
+        [{"effort": [], "count": []}, {"effort": [1.0, 2.0], "count": [3]}, {"effort": [5.0], "count": [4]}],
+        {"effort[0]": [None, 1.0, 5.0], "effort[1]": [None, 2.0, None], "count[0]": [None, 3.0, 4.0]},
+    ),
+    "empty in every message": ("float64[] velocity\nint32 k\n", [{"velocity": [], "k": 1}] * 2, {"k": [1, 1]}),
+    "bounded": ("float64[<=3] position\n", [{"position": [1.0]}, {"position": [2.0]}], {"position[0]": [1.0, 2.0]}),
+    "of messages": (
+        NESTED,
+        [
+            {"arms": [{"name": "l", "joints": [{"position": 1.0, "flags": [1, 2]}]}]},
+            {
+                "arms": [
+                    {"name": "l", "joints": [{"position": 2.0, "flags": [3, 4]}] * 2},
+                    {"name": "r", "joints": []},
+                ]
+            },
+        ],
+        {
+            "arms.name[0]": ["l", "l"],
+            "arms.name[1]": ["", "r"],
+            "arms.joints[0].position[0]": [1.0, 2.0],
+            "arms.joints[0].position[1]": [None, 2.0],
+            "arms.joints[0].flags[0][0]": [1, 3],
+            "arms.joints[0].flags[0][1]": [2, 4],
+            "arms.joints[0].flags[1][0]": [None, 3.0],
+            "arms.joints[0].flags[1][1]": [None, 4.0],
+        },
+    ),
+    "longer than a table is wide": ("uint8[] data\n", [{"data": [7] * 300}] * 2, {"data": [" ".join("7" * 300)] * 2}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("chunk_size", [10, 1 << 20])
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_every_element_of_a_sequence_is_a_column(tmp_path, name, chunk_size):
+    """Of bags of other programs (`mcap-ros2-support` writes them here), in one chunk or in many."""
+    pytest.importorskip("pyarrow")
+    from mcap_ros2.writer import Writer as Ros2Writer
+    from pyarrow import parquet
+
+    schema, messages, expected = SEQUENCES[name]
+    with (tmp_path / "bag.mcap").open("wb") as file:
+        writer = Ros2Writer(file, chunk_size=chunk_size)
+        kind = writer.register_msgdef("a/Msg", schema)
+        for n, message in enumerate(messages):
+            writer.write_message("/t", kind, message, log_time=n, publish_time=n)
+        writer.finish()
+    for ending in ("csv", "parquet"):
+        out = tmp_path / f"t.{ending}"
+        assert main([ending, str(tmp_path / "bag.mcap"), "--topic", "/t", "--out", str(out)]) == 0
+    table = parquet.read_table(tmp_path / "t.parquet").to_pydict()
+    assert table.pop("log_time_ns") == list(range(len(messages)))
+    whole = {
+        key: [None if isinstance(each, float) and math.isnan(each) else each for each in column]
+        for key, column in table.items()
+    }
+    assert whole == expected
+    rows = list(csv.DictReader((tmp_path / "t.csv").open()))
+    assert list(rows[0]) == ["log_time_ns", *table]
+    assert {key: [row[key] for row in rows] for key in table} == {
+        key: ["" if each is None else str(each) for each in column] for key, column in expected.items()
+    }
 
 
 def test_a_table_takes_no_more_memory_than_some_chunks(tmp_path):
