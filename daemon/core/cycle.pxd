@@ -23,6 +23,7 @@ cdef struct ViewBlock:  # a `JointView`
     uint16_t input_flags, latched
     double reference_nm, age_ms
     double torque_rate_nm_s, contact_nm
+    uint32_t latches, released
 
 cdef struct MeasuredBlock:  # a `Measured`
     double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, sensor_nm, temperature_c

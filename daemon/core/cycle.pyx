@@ -268,8 +268,8 @@ cdef class SnapshotWriter:
             block.status_since[n] = self.since[n]
             block.joints[n] = ViewBlock(
                 s.torque_nm, s.sigma_nm, s.tob_nm, s.physics_nm, s.network_nm, s.sensor_torque_nm,
-                s.statusword, s.status, s.sensor_status, s.input_flags, joints[n].latched,
-                s.reference_nm, s.age_ms, s.torque_rate_nm_s, s.contact_nm,
+                s.statusword, s.status, s.sensor_status, s.input_flags, joints[n].held.latched,
+                s.reference_nm, s.age_ms, s.torque_rate_nm_s, s.contact_nm, joints[n].held.latches, joints[n].held.released,
             )
             block.measured[n] = MeasuredBlock(
                 s.current_a, s.motor_position_rad, s.motor_velocity_rad_s, s.link_position_rad, s.sensor_torque_nm,

@@ -6,7 +6,7 @@ from libc.stdint cimport int64_t, uint8_t
 from jtqd.daemon.core.estimate_pdo cimport ContactField, Published
 from jtqd.daemon.core.intake cimport Input, Intake
 from jtqd.daemon.core.record cimport MOST_JOINTS, MOST_METHODS, JointBlock, ShadowBlock
-from jtqd.daemon.core.status cimport JointRules
+from jtqd.daemon.core.status cimport JointRules, StatusState
 from jtqd.estimator.detection cimport ContactLaw, ContactState
 from jtqd.estimator.estimator cimport Estimator
 from jtqd.estimator.observer cimport Reference, Sample
@@ -28,7 +28,8 @@ cdef struct Derived:  # velocity of a drive that sends none
 
 cdef struct JointState:
     int64_t last_ns
-    int status, latched  # as published, and at the last estimate
+    int status  # as published
+    const StatusState *held
     Published published
     JointBlock sample
     ShadowBlock *shadow  # NULL without shadow methods

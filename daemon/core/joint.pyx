@@ -83,6 +83,7 @@ cdef class JointCycle:
         )
         joint = getattr(estimator, "joint", None)
         self.rules = JointRules(number, snapshot, safety or JointSafety(), estimator.with_network)
+        self.now.held = &self.rules.status.now
         self.estimator, self.gear_ratio = estimator, 1.0 if joint is None else joint.gear_ratio
         self.core = estimator if isinstance(estimator, Estimator) else PythonEstimator(estimator)
         self.intake, self.period_ns = intake, period_ns
@@ -250,7 +251,6 @@ cdef class JointCycle:
         record.torque_rate_nm_s, self.now.load_nm = e.torque_rate_nm_s, e.load_nm
         record.statusword, record.input_flags = statusword, flags
         self.now.status = record.status = status
-        self.now.latched = self.rules.status.now.latched
 
     cdef void miss(self, int flags) noexcept nogil:
         """Handle a missing input: the observer keeps its state (the next dt is longer), nothing is published."""
@@ -262,7 +262,6 @@ cdef class JointCycle:
         record.dt_s = record.reference_nm = record.torque_rate_nm_s = self.now.load_nm = NAN
         record.statusword, record.input_flags = 0, flags
         self.now.status = record.status = status
-        self.now.latched = self.rules.status.now.latched
 
     cpdef void observe_shadows(self) noexcept nogil:
         """Estimate by the shadow methods, after the estimate of this cycle was sent, from the inputs in its record."""

@@ -8,9 +8,9 @@ from jtqd.estimator.estimator cimport Values
 
 cdef struct StatusState:
     int held, asked  # the status that stays until a better one was asked for long enough; the worst of those
-    # bits of faults: of the last cycle, begun since they were counted, since a torque was last published, latched
-    int found, news, reasons, latched
-    int64_t latches
+    # bits of faults: of the last cycle, begun since they were counted, since a torque was last published, latched, released last
+    int found, news, reasons, latched, released
+    int64_t latches, counted  # how often a fault was latched; of these, those in the tally
     int64_t needed, calm, run
     int64_t since, window, factor
 

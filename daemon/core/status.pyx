@@ -92,7 +92,7 @@ cdef int _status_of(int latched) noexcept nogil:
 
 @cython.final
 cdef class JointStatus:
-    """State of one joint; `latched` are the bits of its latched faults, `latches` those not yet counted by the tally."""
+    """State of one joint; `latched` are the bits of its latched faults, `latches` is how often there was a new one."""
 
     def __init__(self, settings):
         limit = settings.stale_latch_cycles
@@ -106,13 +106,9 @@ cdef class JointStatus:
     def latched(self):
         return self.now.latched
 
-    @property
-    def latches(self):
-        return self.now.latches
-
     def reset_latch(self):
         """Release latched faults; an existing fault latches again in the next cycle. Return whether there was one."""
-        was, self.now.latched = self.now.latched, 0
+        was, self.now.latched, self.now.released = self.now.latched, 0, self.now.latched or self.now.released
         return bool(was)
 
     cpdef int update(self, int status, int found) noexcept nogil:
@@ -371,8 +367,8 @@ cdef class JointRules:
             state.news = 0
         flags = (state.reasons & 0xFF) << 8
         if state.latched:
-            self.counters[LATCHES] += state.latches
-            state.latches = 0
+            self.counters[LATCHES] += state.latches - state.counted
+            state.counted = state.latches
             flags |= FLAG_LATCHED | (state.latched & 0xFF) << 8
         return flags
 

@@ -45,6 +45,8 @@ class JointView(NamedTuple):
     age_ms: float = nan
     torque_rate_nm_s: float = nan
     contact_nm: float = nan
+    latches: int = 0  # how often a fault was latched
+    released: int = 0  # bits of the faults that a reset released last
 
 
 class ShadowView(NamedTuple):
@@ -166,16 +168,14 @@ LATE_BINS, LATE_BIN_NS = 250, 4_000
 MAX_INPUTS = 20
 """Four TPDOs of each of four drives and two sensor channels are eighteen."""
 
-_MAGIC = 0x4A54_5144_5354_410E  # "JTQDSTA", layout 14
+_MAGIC = 0x4A54_5144_5354_410F  # "JTQDSTA", layout 15
 _HEAD = struct.Struct("<QQddQ")
 """Magic number, process, period [s], worst load, number of joints."""
-JOINT = struct.Struct("<6dHBBHH4d")
+JOINT = struct.Struct("<6dHBBHH4dII")
 ESTIMATE = struct.Struct(f"<qQqq{MOST_JOINTS}q")
 MEASURED = struct.Struct("<6d")
-INPUT = struct.Struct("<12q")
-"""An `InputView`."""
-PAST_WORDS = 264
-"""Room for the state of an estimator."""
+INPUT = struct.Struct("<12q")  # an `InputView`
+PAST_WORDS = 264  # room for the state of an estimator
 LEARNED = struct.Struct(f"<7d3Q{8 * PAST_WORDS}s")
 """`Zeros`, length of the state [byte], the state."""
 ESTIMATE_SIZE = ESTIMATE.size + MOST_JOINTS * (JOINT.size + MEASURED.size)

@@ -41,8 +41,7 @@ from jtqd.estimator.status import Zeros
 
 NEAR_SIGMAS = 2.0
 """A deviation ends within so many sigmas: on the edge it does not begin again and again."""
-_GAP_S = 0.5
-"""Readings further apart say nothing about the time between them."""
+_GAP_S = 0.5  # readings further apart say nothing about the time between them
 COUNTER_QUIET_S = 1.0
 """A condition that shows by a counter has ended when the counter has stood still for so long."""
 _STOPPED_S = 0.25
@@ -156,10 +155,10 @@ class _Joint:
     temperature: str | None
     network_limit_nm: float | None
     sensor_zero_nm: float
-    well: dict[str, int] = field(default_factory=dict)
-    """Counters when it last had inputs."""
+    well: dict[str, int] = field(default_factory=dict)  # counters when it last had inputs
     faults: int = 0
-    latched: int = 0
+    latches: int = 0
+    until_s: float = -inf  # what was latched last is reported, however soon it was released
     jumps: int = 0
     deviation: Deviation = field(default_factory=Deviation)
 
@@ -270,14 +269,16 @@ class Health:
 
     def _observe_status(self, joint: _Joint, seen: JointView, zeros: Zeros, now_s: float) -> None:
         conditions, subject = self._conditions, joint.subject
-        present = seen.input_flags >> 8 | seen.latched
-        faults = fault_meanings(present, names=True)
+        if again := seen.latches != joint.latches:
+            joint.until_s = now_s + COUNTER_QUIET_S
+        latched = seen.latched or (seen.released if now_s < joint.until_s else 0)
+        present = seen.input_flags >> 8 | latched
         joins = bool(present & ~joint.faults)
-        conditions.update("joint_fault", subject, present != 0, now_s, faults, log_again=joins)
-        latched = fault_meanings(seen.latched, names=True)
-        joins = bool(seen.latched & ~joint.latched)
-        conditions.update("fault_latched", subject, seen.latched != 0, now_s, latched, log_again=joins)
-        joint.faults, joint.latched = present, seen.latched
+        for name, bits, news in (("joint_fault", present, joins), ("fault_latched", latched, again)):
+            conditions.update(
+                name, subject, bits != 0, now_s, fault_meanings(bits, names=True), log_again=news
+            )
+        joint.faults, joint.latches = present, seen.latches
         drive = partial(drive_reason, seen)
         conditions.update("drive_fault", subject, seen.status == st.DRIVE_FAULT, now_s, drive)
         conditions.update("drive_off", subject, seen.status == st.OFF, now_s, drive)

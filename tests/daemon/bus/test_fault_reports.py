@@ -51,6 +51,27 @@ def test_a_latched_fault_is_reported_with_its_release() -> None:
     ]
 
 
+def test_a_fault_that_was_latched_and_released_between_two_readings_is_reported(errors: OwnErrors) -> None:
+    """Both messages come, though the second waits for the inhibit time: the error lasts a second."""
+    watch = Observer()
+    watch.conditions.subscribe(errors.follow)
+    released = WELL._replace(latches=1, released=JUMP)
+    assert watch.lines(reading(1, WELL._replace(released=TORSION)), 0.0) == [], "released before the start"
+    assert watch.lines(reading(2, released), 0.05) == [
+        "joint 1: no torque: the motor position jumped (motor_jump)",
+        "joint 1: latched: the motor position jumped (motor_jump); `jtq control reset` releases it",
+    ]
+    for n, now in enumerate((0.1, 0.3, 0.5, 0.7, 0.9, 1.0), start=3):
+        assert watch.lines(reading(n, released), now) == []
+        assert {(0xFF01, 1), (0xFF02, 1)} <= set(errors.present)
+    assert watch.lines(reading(9, released), 1.1) == [
+        "joint 1: fault cleared after 1.1 s",
+        "joint 1: latched faults released after 1.1 s",
+    ]
+    again = released._replace(latches=2, released=JUMP | TORSION)
+    assert len(watch.lines(reading(10, again), 9.0)) == 2
+
+
 def test_a_fault_that_comes_and_goes_is_few_lines() -> None:
     watch = Observer()
     lines = [
@@ -66,7 +87,7 @@ def node(tmp_path: Path) -> tuple[ObjectStore, Snapshot, SnapshotReader]:
     """jtqd's own node beside a snapshot."""
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.8)
     reader = SnapshotReader(tmp_path / "s", supervisor=True)
-    store = ObjectStore(read_eds(JTQD_EDS, 0x20).entries, 0x20)
+    store = ObjectStore(read_eds(JTQD_EDS, 0x20), 0x20)
     OwnNode(store, load_config(None), reader)
     return store, snapshot, reader
 

@@ -284,7 +284,11 @@ def test_a_jump_is_latched_until_the_reset_and_the_record_tells_it_all(
     resets = [n for n, record in enumerate(records) if cr.header_of(record).flags & cr.FLAG_RESET]
     assert resets == [400]
     clock.turn(cycle, 9)
-    assert SnapshotReader(tmp_path / "snapshot").read().counters["latch_resets"] == 1
+    view = SnapshotReader(tmp_path / "snapshot").read()
+    assert view.counters["latch_resets"] == 1
+    one, two = view.joints
+    assert (one.latched, one.latches, faults.names_of(one.released)) == (0, 1, ("motor_jump",))
+    assert (two.latched, two.latches, two.released) == (0, 0, 0)
 
 
 def test_a_reset_without_a_latch_does_nothing(tmp_path: Path, clock: ExactTime) -> None:

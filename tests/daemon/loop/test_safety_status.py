@@ -209,7 +209,7 @@ def test_what_is_latched_by_default_stays_until_the_reset(fault: str, status: in
     state = settled()
     state.update(VALID, faults.BITS[fault])
     assert set(asked(state, [VALID] * 10_000)) == {status}
-    assert (faults.names_of(state.latched), state.latches) == ((fault,), 1)
+    assert faults.names_of(state.latched) == (fault,)
     assert state.reset_latch()
     out = asked(state, [VALID] * 200)
     assert out[: NEEDED[INVALID] - 1] == [INVALID] * (NEEDED[INVALID] - 1)

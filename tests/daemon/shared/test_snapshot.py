@@ -16,8 +16,8 @@ from jtqd.estimator.status import STALE
 from tests.daemon.loop.cycle_helpers import frame, inputs, make, turn
 from tests.daemon.snapshots import EstimateWriter
 
-ONE = (1.0, 0.1, 1.1, 1.2, math.nan, 0.9, 0x27, 2, 0, 7, 0, 0.8, 1.25, 40.0, math.nan)
-TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1, 0x2403, 0x104, math.nan, 5.0, math.nan, 0.3)
+ONE = (1.0, 0.1, 1.1, 1.2, math.nan, 0.9, 0x27, 2, 0, 7, 0, 0.8, 1.25, 40.0, math.nan, 0, 0)
+TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1, 0x2403, 0x104, math.nan, 5.0, math.nan, 0.3, 3, 0x4)
 
 
 def test_round_trip(tmp_path: Path) -> None:
