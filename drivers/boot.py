@@ -540,7 +540,9 @@ def known_nodes(request: BootRequest, heard: Heard) -> dict[str, Any]:
     absent: dict[int, BootError] = {}
     identities = {}
     for each in request.nodes:
-        node, store = each.node, ObjectStore(read_eds(each.eds, each.node) if each.eds else [], each.node)
+        node, eds = each.node, read_eds(each.eds, each.node) if each.eds else None
+        store = ObjectStore(eds.entries if eds else [], node)
+        notes += eds.notes if eds else ()
         try:
             booted[node] = NodeBoot(store, each.profile, request).describe(pinned=each.pinned, eds=each.eds)
         except BootError as error:
@@ -596,7 +598,7 @@ def interval_us(frames: Sequence[tuple[int, int]]) -> float | None:
 def main(argv: list[str]) -> int:
     """Read a request from standard input, boot, print the report; return the exit status. Never a traceback."""
     try:
-        own = {"own_entries": entries_to_json(read_eds(argv[0], int(argv[1])))} if argv else {}
+        own = {"own_entries": entries_to_json(read_eds(argv[0], int(argv[1])).entries)} if argv else {}
         request = parse_request(_read_request())
         if request.guest:
             with _errors_of_bus(request.bus):

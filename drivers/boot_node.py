@@ -31,6 +31,7 @@ from jtqd.drivers.drive import (
     select_tpdos,
     tpdos_as_json,
 )
+from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.own_objects import JTQD_NODE
 from jtqd.drivers.pdo import (
     ACYCLIC,
@@ -47,6 +48,7 @@ from jtqd.drivers.pdo import (
     Tpdo,
     read_tpdos,
     tpdo_parameters,
+    whole_entry,
 )
 from jtqd.drivers.sdo import (
     NO_OBJECT,
@@ -127,7 +129,7 @@ class NodeObjects:
         """Upload an object that nothing depends on; None where the device gives none, for whatever reason."""
         try:
             return self.access.read(*key)
-        except (SdoAbort, SdoTimeout):
+        except (SdoAbort, SdoTimeout, EdsError):
             return None
 
     def optional_number(self, key: Key, size: int, letter: str = "") -> int | None:
@@ -182,8 +184,9 @@ class NodeObjects:
 
     def _no_answer(self, key: Key, timeout: SdoTimeout, letter: str) -> BootError:
         where = label(*key)
-        detail = f"no answer to SDO {where} within {timeout.waited_s:g} s"
-        return BootError(self.node, where, expected="an answer", found="none", letter=letter, detail=detail)
+        detail = str(timeout).replace("no answer", f"no answer to SDO {where}", 1)
+        found = timeout.refused or "none"
+        return BootError(self.node, where, expected="an answer", found=found, letter=letter, detail=detail)
 
     def _refused(self, key: Key, what: str, abort: SdoAbort, letter: str) -> BootError:
         """`what` is "read" or "write of 0x60640020"."""
@@ -351,7 +354,8 @@ class TpdoSetup:
 
     def _holds(self, row: _Row) -> bool:
         key, value, size, _ = row
-        return self._objects.number(key, size) == value
+        found = self._objects.number(key, size)
+        return value in (found, whole_entry(found) if size == 4 else found)  # 4: a mapping entry
 
     def _timers_as_wanted(self, pdo: PdoMap) -> bool:
         if not _is_temperature(pdo):
@@ -394,7 +398,8 @@ class TpdoSetup:
     def _require_mapping(self, pdo: PdoMap, transmission_type: int) -> None:
         """Read mapping and transmission type back."""
         for row in _mapping_rows(pdo, transmission_type):
-            self._objects.require(*row)
+            if not self._holds(row):
+                self._objects.require(*row)
 
     def _change(self, key: Key, value: int, size: int) -> None:
         """Write a number, and remember the one that it replaces."""
@@ -453,13 +458,16 @@ class TpdoSetup:
         objects = NodeObjects(self._objects.access, self._profile.node_id)  # values that are not in force
         for tpdo in read_tpdos(lambda key: objects.optional_number(key, 4)):
             try:
+                if tpdo.fault:
+                    raise PdoError(tpdo.fault)
                 if only_valid and not tpdo.on:
                     raise PdoError("it is switched off (bit 31 of its COB-ID)")
                 if tpdo.extended:
                     raise PdoError(f"TPDO{tpdo.number} has a 29-bit COB-ID")
                 maps.append(self._map_of(tpdo))
+                self._notes += [tpdo.note] if tpdo.note else []
             except PdoError as error:
-                if tpdo.words:
+                if tpdo.words or tpdo.fault:
                     unusable.append(f"TPDO{tpdo.number}: {error}")
         return maps, unusable
 

@@ -359,6 +359,8 @@ def map_of(node: int, tpdo: Tpdo, objects: DriveObjects) -> PdoMap:
     Entries that carry a quantity have its name and sign, the others neither. Raises PdoError for an identifier that is not
     one of the node's four, for a quantity that is mapped with another length, and for what no `PdoMap` can be.
     """
+    if tpdo.fault:
+        raise PdoError(tpdo.fault)
     if tpdo.cob_id - node not in TPDO_BASES:
         known = ", ".join(f"{base + node:03X}h" for base in TPDO_BASES)
         raise PdoError(f"TPDO{tpdo.number} has COB-ID {tpdo.cob_id:03X}h, expected one of {known}")

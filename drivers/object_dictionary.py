@@ -8,11 +8,12 @@ no block transfer. No bus and no clock.
 
 from __future__ import annotations
 
-import io
 import logging
+import re
 import struct
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from configparser import NoOptionError, RawConfigParser
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from jtqd.drivers.sdo import (
     UNKNOWN_COMMAND,
     VALUE_RANGE,
     WRITE_OF_READ_ONLY,
+    Key,
     SdoAbort,
     abort_frame,
     label,
@@ -55,6 +57,7 @@ _INTEGERS = {
 _LETTERS = {**_INTEGERS, REAL32: "f", REAL64: "d"}
 _LAYOUTS = {data_type: struct.Struct("<" + letter) for data_type, letter in _LETTERS.items()}
 _SIGNED = frozenset({0x02, 0x03, 0x04, 0x15})
+_DOMAIN, _VAR = 2, 7  # object types of a single variable (CiA 301, 7.4.3)
 _FIRST_REAL_INDEX = 0x1000  # below: dummy entries of [DummyUsage], which are types and not objects
 _LARGEST_EDS = 16_000_000
 """Bytes; those of large drives have one million."""
@@ -92,6 +95,8 @@ class Entry:
     low: int | None
     high: int | None
     default: bytes
+    fault: str = ""
+    """Why it cannot be read, with file, line and section; "" where it can. Its data type is then 0, or its default zero."""
 
     @property
     def layout(self) -> struct.Struct | None:
@@ -138,7 +143,7 @@ class ObjectStore:
             raise ValueError(f"node id {node_id}, expected 1..127")
         self.node_id = node_id
         if isinstance(entries, Path | str):
-            entries = read_eds(entries, node_id)
+            entries = read_eds(entries, node_id).entries
         self.entries: dict[tuple[int, int], Entry] = {(each.index, each.subindex): each for each in entries}
         self._indices: set[int] = {index for index, _ in self.entries}
         self._values = {key: entry.default for key, entry in self.entries.items()}
@@ -148,10 +153,12 @@ class ObjectStore:
     # Access of a remote client ------------------------------------------------------------------------
 
     def entry(self, index: int, subindex: int) -> Entry:
-        """Return the description of an object. Raises SdoAbort 06020000h or 06090011h when there is none."""
+        """Return the description of an object. Raises SdoAbort 06020000h or 06090011h when there is none, EdsError."""
         found = self.entries.get((index, subindex))
         if found is None:
             raise SdoAbort(NO_SUBINDEX if index in self._indices else NO_OBJECT)
+        if found.fault:
+            raise EdsError(found.fault)
         return found
 
     def read(self, index: int, subindex: int) -> bytes:
@@ -250,34 +257,153 @@ class ObjectStore:
 
 
 class EdsError(OneLineError):
-    """An EDS file that cannot be read; the message is one line with its path."""
+    """An EDS file, or an entry of it, that cannot be read; the message is one line with its path."""
 
 
-def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
-    """Read the entries of an EDS file, with $NODEID filled in.
+@dataclass(frozen=True)
+class Eds:
+    """An EDS, or a DCF with the values of a configured device.
 
-    The parser is canopen's. It is loaded here and not with this module: it takes 20 MB, and a process that is
-    given its entries as JSON (`entries_to_json`, `entries_from_json`) does without. Raises EdsError.
+    Attributes:
+        entries: sorted; one that cannot be read has a `fault`.
+        notes: a line for each line and entry that cannot be read, with section and line of the file.
+        configured: it has values in use (ParameterValue) beside defaults.
+        node, bitrate: node-ID, and bit rate [bit/s], of the configured device; None: it has none.
     """
-    from canopen.objectdictionary import eds as parser
 
+    entries: tuple[Entry, ...]
+    notes: tuple[str, ...]
+    configured: bool
+    node: int | None
+    bitrate: int | None
+
+
+def read_eds(eds: Path | str, node_id: int) -> Eds:
+    """Read an EDS or DCF, with $NODEID filled in. An entry that cannot be read refuses none of the others.
+
+    An entry becomes a variable by canopen's parser. It is loaded here and not with this module: it takes 20 MB, and a
+    process that is given its entries as JSON (`entries_to_json`, `entries_from_json`) does without. Raises EdsError for a
+    file without an object.
+    """
     name = str(eds) if str(eds).isprintable() else repr(str(eds))
-    text = _eds_text(eds)
-    logger = logging.getLogger(parser.__name__)
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)  # an EdsError has the reason in one line
-    entries = []
+    sections, odd = _sections(_eds_text(eds), name)
+    _expand_compact(sections)
+    entries = _entries(sections, node_id)
+    if not entries:
+        raise EdsError(f"{name}: found no object in it, expected an EDS or DCF (CiA 306)")
+    setup = sections.get("DEVICECOMISSIONING") or sections.get("DEVICECOMMISSIONING") or _Section(name, "", 0)
+    node, kilobit = setup.number("NodeID", 127), setup.number("Baudrate", 1000)
+    odd += [(each.line, each.fault) for each in sections.values() if each.fault]
+    notes = list(dict.fromkeys(text for _, text in sorted(odd)))
+    if len(notes) > _MOST_NOTES:
+        notes[_MOST_NOTES:] = [f"{name}: {len(notes) - _MOST_NOTES} more lines that cannot be read"]
+    if node not in (None, node_id):
+        notes.append(f"{name}: of node {node} by its NodeID, read for node {node_id}")
+    return Eds(
+        tuple(sorted(entries, key=lambda each: (each.index, each.subindex))),
+        tuple(notes),
+        any("parametervalue" in each.values for each in sections.values()),
+        node,
+        None if kilobit is None else 1000 * kilobit,
+    )
+
+
+_OBJECT = re.compile(r"([0-9A-F]{1,4})(?:sub([0-9A-F]{1,2})|(NAME|VALUE))?")
+_MOST_NOTES = 8
+_DESCRIBING = ("DataType", "AccessType", "PDOMapping", "ObjectType", "CompactSubObj")
+_DECIDING = {each.lower(): each for each in (*_DESCRIBING, "DefaultValue", "ParameterValue")}
+"""Keys by which an entry is what it is."""
+
+
+@dataclass
+class _Section:
+    """A section of a file: its values by lower-case key with the line of each, and why its entry cannot be read."""
+
+    file: str
+    title: str
+    line: int
+    values: dict[str, str] = field(default_factory=dict)
+    lines: dict[str, int] = field(default_factory=dict)
+    fault: str = ""
+
+    def at(self, line: int, what: str) -> str:
+        """Return a note on a line."""
+        return f"{self.file}: line {line}, [{self.title}]: {what}"
+
+    def refuse(self, key: str, what: str) -> None:
+        """Make it a fault that cannot be read, the first one for all."""
+        self.fault = self.fault or self.at(self.lines.get(key.lower(), self.line), what)
+
+    def number(self, key: str, most: int) -> int | None:
+        """Return a number from 1 on; None where there is none, which is a fault for a text that is no such number."""
+        text = self.values.get(key.lower(), "")
+        value = _whole(text)
+        if value is not None and 1 <= value <= most:
+            return value
+        if text and value != 0:
+            self.refuse(key, f"{key}={_shown(text)}, expected 1..{most}")
+        return None
+
+
+def _sections(text: str, name: str) -> tuple[dict[str, _Section], list[tuple[int, str]]]:
+    """Return the sections by name (1018sub1, 1018; all else in capitals), and what is odd in them: line and note."""
+    section = _Section(name, "", 0)
+    sections: dict[str, _Section] = {}
+    odd: list[tuple[int, str]] = []
+    for number, whole in enumerate(re.split(r"\r\n?|\n", text), 1):
+        line = re.split(r"(?:^|\s);|^\s*#", whole, maxsplit=1)[0].strip()
+        if line.startswith("["):
+            written = line.strip("[] \t")
+            title = written.upper().replace("SUB", "sub")
+            if found := _OBJECT.fullmatch(title):
+                title = f"{int(found[1], 16):X}" + (
+                    f"sub{int(found[2], 16):X}" if found[2] else found[3] or ""
+                )
+            section = sections.setdefault(title, _Section(name, _shown(written), number))
+            continue
+        key, equals, value = (each.strip() for each in line.partition("="))
+        own, what = key.lower(), f"found {_shown(line)}"
+        if line and not (key and equals):
+            odd.append((number, section.at(number, f"{what}, expected KEY=VALUE")))
+            decides = re.split(r"\W", own, maxsplit=1)[0] in _DECIDING
+            section.fault = section.fault or (odd[-1][1] if decides else "")
+        elif value and section.values.setdefault(own, value) != value:
+            before = f"line {section.lines[own]} has {_shown(section.values[own])}"
+            odd.append((number, section.at(number, f"{what}, {before}")))
+            section.fault = section.fault or (odd[-1][1] if own in _DECIDING else "")
+        elif value:
+            section.lines[own] = number
+    return sections, odd
+
+
+def _shown(text: str) -> str:
+    """Return text of a file as a line can show it; of a binary file nothing."""
+    return text[:40] if text.isprintable() else "bytes that are no text"
+
+
+def _expand_compact(sections: dict[str, _Section]) -> None:
+    """Give the members that an object has in its own section (CompactSubObj) theirs, with name and value in use."""
+    for title, section in list(sections.items()):
+        if not (found := _OBJECT.fullmatch(title)) or found[2] or found[3]:
+            continue
+        count = section.number("CompactSubObj", 254) or (254 if section.fault else 0)
+        names, values = (sections.get(f"{title}{each}", section).values for each in ("NAME", "VALUE"))
+        first = {"parametername": "Number of entries", "datatype": "5", "accesstype": "ro"}
+        for sub in range(count + 1 if "compactsubobj" in section.values and count else 0):
+            own = {"parametername": names.get(str(sub), f"Member {sub}")}
+            if str(sub) in values:
+                own["parametervalue"] = values[str(sub)]
+            content = {**section.values, **own} if sub else {**first, "defaultvalue": str(count)}
+            made = _Section(section.file, section.title, section.line, content, section.lines, section.fault)
+            sections.setdefault(f"{title}sub{sub:X}", made)
+
+
+def _whole(text: str) -> int | None:
+    """Return a whole number as CiA 306 writes it; None for other text, and for digits that are another number in octal."""
     try:
-        for parsed in parser.import_eds(io.StringIO(text), node_id).values():
-            if parsed.index >= _FIRST_REAL_INDEX:
-                members = parsed.subindices.values() if hasattr(parsed, "subindices") else [parsed]
-                entries += [_entry(member) for member in members]
-    except Exception as error:  # the parser has no exception class of its own
-        reason = " ".join(str(error).split())[:200]
-        raise EdsError(f"{name}: not a readable EDS: {type(error).__name__}: {reason}") from None
-    finally:
-        logger.setLevel(level)
-    return entries
+        return int(text, 0)
+    except ValueError:
+        return int(text) if re.fullmatch("0+[1-7]", text) else None
 
 
 def _eds_text(eds: Path | str) -> str:
@@ -309,27 +435,68 @@ def entries_from_json(rows: Any) -> list[Entry]:
     return msgspec.convert(rows, list[Entry])
 
 
-def _entry(variable: Any) -> Entry:
-    """Return one variable of a parsed EDS, or member of an array or record."""
-    data_type, of_dcf = int(variable.data_type), getattr(variable, "value_raw", "")  # as it is configured
-    default = variable.default if variable.value is None else variable.value
-    layout = _LAYOUTS.get(data_type)
-    if layout is not None:
-        if of_dcf and variable.value is None:
-            raise ValueError(f"ParameterValue={of_dcf} of {variable.name}, expected a number")
-        default = layout.pack(default if default is not None else 0)
-    elif not isinstance(default, bytes):
-        default = b"" if default is None else str(default).encode("ascii")
+def _entries(sections: Mapping[str, _Section], node_id: int) -> list[Entry]:
+    """Return the entries of all objects, with what cannot be read of them as their fault."""
+    from canopen.objectdictionary import eds as parser
+
+    found = {title: match for title in sections if (match := _OBJECT.fullmatch(title)) and not match[3]}
+    file = RawConfigParser()
+    file.read_dict({title: {"parametername": "", **sections[title].values} for title in found})
+    level = parser.logger.level
+    parser.logger.setLevel(logging.CRITICAL)  # a fault has the reason in one line
+    try:
+        return [
+            _entry(file, title, sections[title], (index, int(match[2] or "0", 16)), node_id)
+            for title, match in found.items()
+            if (index := int(match[1], 16)) >= _FIRST_REAL_INDEX
+            and (match[2] or _whole(sections[title].values.get("objecttype", "7")) in (_DOMAIN, _VAR, None))
+        ]
+    finally:
+        parser.logger.setLevel(level)
+
+
+def _entry(file: RawConfigParser, title: str, section: _Section, key: Key, node_id: int) -> Entry:
+    from canopen.objectdictionary import eds as parser
+
+    index, subindex = key
+    parent = file.get(f"{index:X}", "parametername", fallback="") if subindex else ""
+    name = ": ".join(filter(None, (parent, section.values.get("parametername", ""))))
+    try:
+        variable = parser.build_variable(file, title, node_id, index, subindex)
+    except Exception as error:  # the parser has no exception class of its own
+        what = " ".join(str(error).split())[:80]
+        if isinstance(error, NoOptionError):
+            what = f"no {_DECIDING.get(error.option, error.option)}"
+        section.refuse("", what if what.isprintable() else type(error).__name__)
+        return Entry(index, subindex, name, 0, "", False, None, None, b"", section.fault)
+    in_use = "parametervalue" in section.values  # of a DCF
+    name_of_value, value = (
+        ("ParameterValue", variable.value) if in_use else ("DefaultValue", variable.default)
+    )
+    text = section.values.get(name_of_value.lower(), "")
+    layout = _LAYOUTS.get(variable.data_type)
+    if layout is None:
+        data = value if isinstance(value, bytes) else str(value or "").encode("ascii", "replace")
+    else:
+        value, bits = _whole(text or "0") if value is None else value, 8 * layout.size
+        if variable.data_type in _SIGNED and text[:2] in ("0x", "0X") and (value or 0) >> bits - 1:
+            value -= 2**bits  # written as its two's complement
+        try:
+            data = layout.pack(value)
+        except (struct.error, OverflowError):
+            data = bytes(layout.size)
+            section.refuse(name_of_value, f"{name_of_value}={_shown(text)}, expected a number of {bits} bits")
     return Entry(
-        index=variable.index,
-        subindex=variable.subindex,
-        name=variable.name if variable.subindex == 0 else f"{variable.parent.name}: {variable.name}",
-        data_type=data_type,
+        index=index,
+        subindex=subindex,
+        name=name,
+        data_type=variable.data_type,
         access=variable.access_type,
         mappable=bool(variable.pdo_mappable),
         low=variable.min,
         high=variable.max,
-        default=default,
+        default=data,
+        fault=section.fault,
     )
 
 

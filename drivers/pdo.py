@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from jtqd.drivers.frame import CAN_EFF_MASK
-from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.object_dictionary import EdsError, ObjectStore
 from jtqd.drivers.sdo import DEVICE_STATE, NOT_MAPPABLE, PDO_TOO_LONG, VALUE_RANGE, Key, SdoAbort, label
 
 MAX_PDO_BYTES = 8
@@ -147,6 +147,8 @@ class Tpdo:
         extended: its COB-ID has 29 bits.
         timer_ms: its event timer (1800h:5); 0: none, or not read.
         mapping_fixed, type_fixed: by its EDS they cannot be written; on a bus this is not known.
+        bit_7: the length of an entry has bit 7 set, which `words` have not.
+        fault: why its EDS cannot be read there; it is then as if switched off.
     """
 
     number: int
@@ -158,6 +160,14 @@ class Tpdo:
     timer_ms: int = 0
     mapping_fixed: bool = False
     type_fixed: bool = False
+    bit_7: bool = False
+    fault: str = ""
+
+    @property
+    def note(self) -> str:
+        """What is odd in its mapping and does not matter; "" for nothing."""
+        text = f"TPDO{self.number}: taken as {', '.join(self.objects)}, without bit 7 of a length"
+        return text if self.bit_7 else ""
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -170,20 +180,32 @@ def read_tpdos(number_of: Callable[[Key], int | None]) -> list[Tpdo]:
     found = []
     for number in range(1, TPDO_COUNT + 1):
         communication, mapping = tpdo_parameters(number)
-        cob_id = number_of((communication, 1))
-        if cob_id is None:
+        try:
+            cob_id = number_of((communication, 1))
+            if cob_id is None:
+                continue
+            kind, count = ((number_of(key) or 0) & 0xFF for key in ((communication, 2), (mapping, 0)))
+            subs = range(1, min(count, 8 * MAX_PDO_BYTES) + 1)
+            read = tuple(number_of((mapping, sub)) or 0 for sub in subs)
+        except EdsError as error:
+            found.append(Tpdo(number, 0, (), on=False, fault=str(error)))
             continue
-        kind, count = ((number_of(key) or 0) & 0xFF for key in ((communication, 2), (mapping, 0)))
-        words = tuple(number_of((mapping, sub)) or 0 for sub in range(1, min(count, 8 * MAX_PDO_BYTES) + 1))
         extended = bool(cob_id & EXTENDED)
         identifier = cob_id & (CAN_EFF_MASK if extended else CAN_ID)
-        found.append(Tpdo(number, identifier, words, kind, not cob_id & INVALID, extended))
+        words = tuple(map(whole_entry, read))
+        on, bit_7 = not cob_id & INVALID, words != read
+        found.append(Tpdo(number, identifier, words, kind, on, extended, bit_7=bit_7))
     return found
 
 
 def split_word(word: int) -> tuple[int, int, int]:
     """Return (index, subindex, bits) of a mapping entry 0xIIIISSLL."""
     return word >> 16 & 0xFFFF, word >> 8 & 0xFF, word & 0xFF
+
+
+def whole_entry(word: int) -> int:
+    """Return a mapping entry without bit 7 of its length where that is above 64 bits: some drives set it for a sign."""
+    return word & ~0x80 if word & 0xFF > 8 * MAX_PDO_BYTES else word
 
 
 # PDO parameters of an object dictionary ---------------------------------------------------------------------------

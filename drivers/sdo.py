@@ -22,6 +22,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
+from jtqd.estimator.text import counted
 
 Key = tuple[int, int]
 """Index and sub-index of an object."""
@@ -269,6 +270,7 @@ class Exchange:
         refusal: the server's abort code; None: none.
         timed_out: no answer came in time.
         ignored: answers to other requests that came meanwhile.
+        refused: the newest answer that could not be taken, in words; "" for none.
         repeats: of the first request.
     """
 
@@ -285,7 +287,7 @@ class Exchange:
         self.index, self.subindex, self._data = index, subindex, data
         self.value: bytes | None = None
         self.refusal: int | None = None
-        self.timed_out = False
+        self.timed_out, self.refused = False, ""
         self.ignored = self.repeats = 0
         self._answer_s, self._timeout_s = min(answer_s, timeout_s), timeout_s
         self._deadline = now + timeout_s
@@ -318,9 +320,12 @@ class Exchange:
             self.refusal = abort.code
             return []
         except TransferError as error:
+            self.refused = f"an answer: {error}"
             return [self._transfer.abort(error.code), *self._repeat(now)]
         if not taken:
             self.ignored += 1
+            bytes_of = f"of {counted(len(reply), 'byte')}, expected 8"
+            self.refused = f"an answer {bytes_of if len(reply) != 8 else reply.hex(' ')}"
             return []
         if self._transfer.done:
             self.value = self._transfer.value
@@ -429,11 +434,11 @@ class Socket(Protocol):
 
 
 class SdoTimeout(Exception):  # noqa: N818  (a state of the node)
-    """No answer within the waiting time."""
+    """No answer within the waiting time; `refused`: the newest one that could not be taken, in words."""
 
-    def __init__(self, waited_s: float) -> None:
-        super().__init__(f"no answer within {waited_s:g} s")
-        self.waited_s = waited_s
+    def __init__(self, waited_s: float, refused: str = "") -> None:
+        super().__init__(f"no answer within {waited_s:g} s{f'; refused {refused}' if refused else ''}")
+        self.waited_s, self.refused = waited_s, refused
 
 
 class SdoAccess(Protocol):
@@ -481,7 +486,7 @@ class SdoClient:
         if exchange.refusal is not None:
             raise SdoAbort(exchange.refusal)
         if exchange.value is None:
-            raise SdoTimeout(self._timeout_s)
+            raise SdoTimeout(self._timeout_s, exchange.refused)
         return exchange.value
 
     def _send(self, requests: list[bytes]) -> None:

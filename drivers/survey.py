@@ -18,7 +18,7 @@ from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.drive import DRIVE_SCALING_OBJECTS, OTHER_SCALING_OBJECTS, drive_layout
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
-from jtqd.drivers.object_dictionary import VISIBLE_STRING, Entry, read_eds
+from jtqd.drivers.object_dictionary import VISIBLE_STRING, EdsError, Entry, read_eds
 from jtqd.drivers.pdo import SYNC_COB_ID, SYNC_LISTEN_S, TPDO_COUNT, Tpdo, read_tpdos, tpdo_parameters
 from jtqd.drivers.sdo import (
     ANSWER_S,
@@ -67,7 +67,7 @@ class Survey:
     """One device.
 
     Attributes:
-        source: where the values are from: "the bus", or "defaults of NAME.eds".
+        source: where the values are from: "the bus", "defaults of NAME.eds", or "values of NAME.dcf".
         profile: 402, 404 or another device profile; 0: none.
         texts: 1008h to 100Ah by the names of TEXTS, where it has them.
         numbers: objects that it has, with their values (of an EDS: the defaults).
@@ -75,6 +75,7 @@ class Survey:
         unmappable: objects that cannot be mapped by its EDS; empty when read on a bus, where this is not known.
         defaults: the numbers are defaults; the device itself may have others.
         tpdos: as they are configured, where they were read.
+        eds_notes: what cannot be read of its EDS.
     """
 
     node: int
@@ -86,6 +87,12 @@ class Survey:
     unmappable: frozenset[Key] = frozenset()
     defaults: bool = False
     tpdos: tuple[Tpdo, ...] = ()
+    eds_notes: tuple[str, ...] = ()
+
+    @property
+    def notes(self) -> list[str]:
+        """What is odd in its EDS or its mapping, and is used as far as it can be."""
+        return [*self.eds_notes, *(f"node {self.node}: {each.note}" for each in self.tpdos if each.note)]
 
     @property
     def title(self) -> str:
@@ -110,7 +117,10 @@ def tpdos(access: SdoAccess) -> tuple[Tpdo, ...]:
 
 def _tpdos(number_of: Callable[[Key], int | None]) -> tuple[Tpdo, ...]:
     timers = {number: (tpdo_parameters(number)[0], 5) for number in range(1, TPDO_COUNT + 1)}
-    return tuple(replace(pdo, timer_ms=number_of(timers[pdo.number]) or 0) for pdo in read_tpdos(number_of))
+    found = read_tpdos(number_of)
+    return tuple(
+        each if each.fault else replace(each, timer_ms=number_of(timers[each.number]) or 0) for each in found
+    )
 
 
 def _number(access: SdoAccess, key: Key) -> int | None:
@@ -153,11 +163,19 @@ def survey(access: SdoAccess, node: int) -> Survey:
 
 
 def survey_of_eds(path: Path, node: int, more: Iterable[Key] = ()) -> Survey:
-    """Read a device from its EDS; `more`: further objects that shall be among its numbers. Raises EdsError."""
-    entries = {(each.index, each.subindex): each for each in read_eds(path, node)}
+    """Read a device from its EDS or DCF; `more`: further objects that shall be among its numbers.
+
+    Raises EdsError, also for one of its objects that cannot be read; the value of one that is only mapped does not matter.
+    """
+    eds, profile = read_eds(path, node), 0
+    cosmetic = (*TEXTS.values(), IDENTITY["revision"], IDENTITY["serial"])
+    every = {(each.index, each.subindex): each for each in eds.entries}
+    entries = {key: each for key, each in every.items() if not (each.fault and key in cosmetic)}
 
     def number(key: Key) -> int:
         entry = entries[key]
+        if entry.fault and not (entry.data_type and key in MAPPED.get(profile, ())):
+            raise EdsError(entry.fault)
         return int.from_bytes(entry.default, "little") if entry.is_integer else 0
 
     profile = number((0x1000, 0)) & 0xFFFF if (0x1000, 0) in entries else 0
@@ -165,7 +183,7 @@ def survey_of_eds(path: Path, node: int, more: Iterable[Key] = ()) -> Survey:
     optional = UNITS if profile == DRIVE else ()
     return Survey(
         node=node,
-        source=f"defaults of {path.name}",
+        source=f"{'values' if eds.configured else 'defaults'} of {path.name}",
         defaults=True,
         profile=profile,
         texts={
@@ -183,12 +201,15 @@ def survey_of_eds(path: Path, node: int, more: Iterable[Key] = ()) -> Survey:
         tpdos=tuple(
             _fixed_by(each, entries) for each in _tpdos(lambda key: number(key) if key in entries else None)
         ),
+        eds_notes=eds.notes,
     )
 
 
 def _fixed_by(pdo: Tpdo, entries: Mapping[Key, Entry]) -> Tpdo:
     """Return the TPDO with what its EDS has of mapping and transmission type: whether they can be written."""
     communication, mapping = tpdo_parameters(pdo.number)
+    if pdo.fault:
+        return pdo
 
     def fixed(*keys: Key) -> bool:
         return any(key in entries and not entries[key].writable for key in keys)
@@ -237,7 +258,9 @@ class BusSurvey:
         try:
             with self._access(node) as access:
                 return survey(access, node)
-        except SdoTimeout:
+        except SdoTimeout as silence:
+            if silence.refused:
+                raise SurveyError(f"node {node}: {silence}") from None
             return None
 
     def numbers(self, node: int, keys: Iterable[Key]) -> dict[Key, int]:

@@ -31,7 +31,7 @@ def files_of(drives: int) -> dict[int, str]:
 def entries_of(node: int, file: str) -> list[Entry]:
     """Return the entries of a node: those a child has read, else read here and kept."""
     if (node, file) not in _cache:
-        _cache[node, file] = read_eds(FOLDER / file, node)
+        _cache[node, file] = list(read_eds(FOLDER / file, node).entries)
     return _cache[node, file]
 
 

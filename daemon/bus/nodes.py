@@ -172,7 +172,7 @@ class NodeWatch:
 
 SIGNATURE_EVERY = 4
 _CAN_ID, _INVALID, _ALL = 0x7FF, 0x8000_0000, 0xFFFF_FFFF
-_COB_IDS = range(0x1800, 0x1A00)
+_COB_IDS, _MAPPINGS = range(0x1800, 0x1A00), range(0x1A00, 0x1C00)
 _PROFILE, _UNIT = 0x6000, 0x6131
 _MODE_DISPLAY = 0x6061
 
@@ -209,6 +209,8 @@ def checks_of(node: Mapping[str, Any]) -> list[Check]:
         if index in _COB_IDS and subindex == 1:
             # bit 30 is the device's own; of a PDO that is off nothing else matters
             mask = _INVALID if value & _INVALID else _CAN_ID | _INVALID
+        elif index in _MAPPINGS and subindex:
+            mask = _ALL & ~0x80  # bit 7 of a length is none: `pdo.whole_entry`
         checks.append(Check(index, subindex, mask, value & mask))
     if node["gear_ratio"] is not None:
         checks.append(Check(_MODE_DISPLAY, 0, 0xFF, None))

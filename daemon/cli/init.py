@@ -41,7 +41,7 @@ from jtqd.drivers.boot import Heard, interval_us, listen
 from jtqd.drivers.bus_load import LIMIT, BusLoadError
 from jtqd.drivers.drive import drive_layout
 from jtqd.drivers.frame_socket import BusError
-from jtqd.drivers.object_dictionary import EdsError
+from jtqd.drivers.object_dictionary import EdsError, read_eds
 from jtqd.drivers.pdo import EVERY_SYNC, SYNC_COB_ID, TPDO_BASES, Tpdo
 from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Survey
 from jtqd.estimator.command_line import command_parser, count, seconds
@@ -123,11 +123,11 @@ def parser() -> argparse.ArgumentParser:
     add("--bus", metavar="BUS", help="look at the devices on this bus: can0, or unix:PATH")
     tables = "no bus: propose a column map and joint files for these tables (its own options: --from-csv FILE --help)"
     add("--from-csv", type=Path, nargs="+", metavar="FILE", help=tables)
-    eds = "EDS of the drives (one for all, or one for each)"
+    eds = "EDS or DCF of the drives (one for all, or one for each)"
     add("--from-eds", type=Path, action="append", metavar="FILE", help=eds)
     node = (
-        f"node-ID of a drive; again for the next joint, at most {MAX_JOINTS} (default: drives on the bus; with EDS files "
-        "alone 1, 2 as a guess)"
+        f"node-ID of a drive; again for the next joint, at most {MAX_JOINTS} (default: drives on the bus; with files alone "
+        "that of a DCF, else 1, 2 as a guess)"
     )
     text = "with --bus: send nothing, listen for S seconds; for role guest beside another master"
     add("--listen", type=seconds, metavar="S", help=text)
@@ -136,8 +136,8 @@ def parser() -> argparse.ArgumentParser:
     of_sensor = "joint whose torque the sensor measures (default: all)"
     add("--sensor-joint", type=int, action="append", metavar="J", help=of_sensor)
     add_values(made, action="append")
-    bitrate = "of the bus [bit/s] (default 1000000)"
-    add("--bitrate", type=_count, default=1_000_000, metavar="B", help=bitrate)
+    bitrate = "of the bus [bit/s] (default: that of a DCF, else 1000000)"
+    add("--bitrate", type=_count, metavar="B", help=bitrate)
     add(
         "--name",
         type=_name,
@@ -182,6 +182,7 @@ def _run(options: argparse.Namespace) -> int:
         if not options.force and (options.out / name).exists():
             raise UsageError(f"{options.out / name}: exists; --force replaces it")
     found = _devices(options)
+    options.bitrate = found.bitrate
     joints = _joints(options, found)
     sensor = None if found.sensor is None else found.surveys.get(found.sensor)
     text = partial(
@@ -246,19 +247,20 @@ def _text(report: dict[str, Any]) -> str:
 
 
 class _Devices(NamedTuple):
-    """Node-IDs of the drives in the order of the joints (guessed: an EDS is all that is known), of the sensor; surveys."""
+    """Node-IDs of the drives in the order of the joints (guessed: those for which there is but an EDS), of the sensor."""
 
     nodes: list[int]
     sensor: int | None
     surveys: dict[int, Survey]
     notes: list[str]
-    guessed: bool
+    guessed: set[int]
     heard: Heard
+    bitrate: int
 
 
 def _devices(options: argparse.Namespace) -> _Devices:
     """Return the devices by options, bus and EDS. Raises UsageError, BusError, EdsError."""
-    nodes: list[int] = options.node or []
+    nodes, guessed, bitrate = _of_files(options)
     if len(set(nodes)) != len(nodes):
         raise UsageError(f"--node: {nodes} names a node twice")
     surveys: dict[int, Survey] = {}
@@ -279,8 +281,6 @@ def _devices(options: argparse.Namespace) -> _Devices:
         for node in nodes:
             if node not in surveys and not options.from_eds:
                 raise UsageError(f"node {node} does not answer on {options.bus}{_others(surveys)}")
-    guessed = not nodes and options.bus is None and options.from_eds is not None
-    nodes = list(range(1, len(options.from_eds) + 1)) if guessed else nodes
     if not nodes:
         where = f"no CiA 402 drive answers on {options.bus}" if options.bus else "no drive is known"
         raise UsageError(f"{where}: give --node{_others(surveys)}")
@@ -294,13 +294,28 @@ def _devices(options: argparse.Namespace) -> _Devices:
     if sensor and options.bus is not None and not heard and sensor not in surveys:
         raise UsageError(f"--sensor: node {sensor} does not answer on {options.bus}{_others(surveys)}")
     _check_profiles(nodes, sensor, surveys)
+    notes += dict.fromkeys(note for each in surveys.values() for note in each.notes)
     notes += [
         f"node {node}: profile {family.name} ({family.title})"
         for node in nodes
         if (family := family_of(surveys.get(node), options.profile))
     ]
     notes += _heard_lines(heard, surveys)
-    return _Devices(nodes, sensor or None, surveys, notes, guessed, heard)
+    return _Devices(nodes, sensor or None, surveys, notes, guessed, heard, bitrate)
+
+
+def _of_files(options: argparse.Namespace) -> tuple[list[int], set[int], int]:
+    """Return nodes, those of them that are a guess, and the bit rate, by options and DCFs. Raises UsageError, EdsError."""
+    nodes: list[int] = options.node or []
+    files = [read_eds(path, 1) for path in options.from_eds or ()]
+    rates = {each.bitrate for each in files if each.bitrate}
+    if len(rates) > 1 and options.bitrate is None:
+        raise UsageError(f"--from-eds: found bit rates {sorted(rates)}, expected one, or --bitrate")
+    guessed: set[int] = set()
+    if not nodes and options.bus is None:
+        nodes = [each.node or number for number, each in enumerate(files, 1)]
+        guessed = {node for node, each in zip(nodes, files, strict=True) if each.node is None}
+    return nodes, guessed, options.bitrate or max(rates, default=1_000_000)
 
 
 def _listen(options: argparse.Namespace) -> tuple[Heard, list[int]]:
@@ -454,7 +469,9 @@ def _joints(options: argparse.Namespace, found: _Devices) -> list[JointProposal]
         wanted = Wanted(**values, one_encoder=options.one_encoder)
         while len(joints) == n:
             try:
-                joints.append(JointProposal(n + 1, node, survey, wanted, family, node_guessed=found.guessed))
+                joints.append(
+                    JointProposal(n + 1, node, survey, wanted, family, node_guessed=node in found.guessed)
+                )
             except MissingValueError as error:
                 if not ask or not error.field:
                     raise

@@ -191,6 +191,7 @@ def content(survey: Survey, problems: list[str], family: Family | None = None) -
         "missing": [label(*key) for key in sorted(survey.missing)],
         "unmappable": [label(*key) for key in sorted(survey.unmappable)],
         "tpdos": tpdos,
+        "notes": survey.notes,
         "problems": problems,
         "family": None if family is None else family.name,
     }
@@ -213,7 +214,7 @@ def text(
     joint: int = 1,
 ) -> str:
     """Return everything for people."""
-    lines = [f"node {survey.node}: {description(survey)}"]
+    lines = [f"node {survey.node}: {description(survey)}", *survey.notes]
     if family is not None:
         lines.append(f"profile {family.name}: {family.title} (docs/bus.md)")
     lines += [_object(key, _value(key, value)) for key, value in sorted(survey.numbers.items())]

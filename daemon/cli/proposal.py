@@ -242,7 +242,7 @@ def merged(eds: Survey, bus: Survey | None, path: Path) -> Survey:
     for each in bus.tpdos:
         known = by_eds.get(each.number, each)
         tpdos.append(replace(each, mapping_fixed=known.mapping_fixed, type_fixed=known.type_fixed))
-    return replace(bus, unmappable=eds.unmappable, tpdos=tuple(tpdos))
+    return replace(bus, unmappable=eds.unmappable, tpdos=tuple(tpdos), eds_notes=eds.eds_notes)
 
 
 def description(survey: Survey) -> str:

@@ -13,7 +13,7 @@ from jtqd.drivers.boot_node import BootError, BusSettings, NodeBoot, signature
 from jtqd.drivers.drive import DriveProfile, Temperature, drive_tpdo1, drive_tpdo2, drive_tpdo3
 from jtqd.drivers.frame import FRAME
 from jtqd.drivers.object_dictionary import Identity
-from jtqd.drivers.pdo import SYNC_LISTEN_S, PdoParameters
+from jtqd.drivers.pdo import SYNC_LISTEN_S, PdoParameters, whole_entry
 from jtqd.drivers.sensor import SensorProfile, sensor_tpdo1, sensor_tpdo2
 from tests.drivers.canopen_nodes import HubResponder, Responder, TestNode, boot_all, drive_store, sensor_store
 from tests.paths import ROOT
@@ -678,6 +678,28 @@ def test_another_fixed_mapping_is_used_as_it_is(bench, writable):
     assert watched[0x1A01, 2] == 0x6078_0010, "and watched in service"
     again = bench.boot().nodes[1].configuration_sha256
     assert again == node.configuration_sha256, "what the attempt has read is not in it"
+
+
+@pytest.mark.parametrize("layout", [RIGHT, ELSEWHERE])
+@pytest.mark.parametrize("writable", [(), COB_IDS])
+def test_bit_7_of_a_mapped_length_does_not_count(bench, layout, writable):
+    """Some drives set it for a signed object; what else is above 64 bits is no length."""
+    odd = {0x6064_0020, 0x606C_0020, 0x6078_0010, 0x60E4_0120}
+    words = [tuple(word | 0x80 if word in odd else word for word in pdo) for pdo in layout]
+    fixed(bench.drive1, *words, writable=writable)
+    node = bench.boot().nodes[1]
+    assert bench.drive1.state == 5
+    assert [pdo.words for pdo in node.tpdos] == list(layout)
+    assert "TPDO1: taken as " in "".join(node.notes) or layout == RIGHT
+    again = bench.boot().nodes[1]
+    assert (again.configuration_sha256, again.tpdos) == (node.configuration_sha256, node.tpdos)
+
+
+@pytest.mark.parametrize(
+    ("bits", "taken"), [(0xA0, 32), (0x90, 16), (0xC0, 64), (0x48, 72), (0xC8, 72), (0x40, 64)]
+)
+def test_lengths_of_a_mapping(bits, taken):
+    assert whole_entry(0x6064_0000 | bits) == 0x6064_0000 | taken
 
 
 def test_a_temperature_in_a_fixed_mapping_is_used_where_it_is_alone_in_tpdo3(bench):

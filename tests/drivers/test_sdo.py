@@ -218,6 +218,55 @@ def test_a_size_that_is_not_kept_and_one_that_is_too_large():
         send_for_ever()
 
 
+@pytest.mark.parametrize(
+    ("replies", "words"),
+    [
+        ([], ""),
+        (["4b 00 10 00 92 01"], "an answer of 6 bytes, expected 8"),
+        (["4f"], "an answer of 1 byte, expected 8"),
+        (["80 00 10 00"], "an answer of 4 bytes, expected 8"),
+        (["43 18 10 01 a1 07 00 00"], "an answer 43 18 10 01 a1 07 00 00"),
+        (["41 00 10 00 09 00 00 00", "11 00 00 00 00 00 00 00"], "an answer: toggle bit not alternated (05030000h)"),
+        (["41 00 10 00 ff ff ff 00"], "an answer: out of memory (05040005h)"),
+    ],
+)  # fmt: skip
+def test_an_answer_that_is_refused_is_no_silence(replies, words):
+    """Told with the object that had no answer, and in the boot as well."""
+    sent = []
+
+    class Served:
+        def __init__(self):
+            self.frames, self._ready = bytearray(), []
+
+        def send(self, packed):
+            sent.append(packed)
+            self._ready = [frame(each) for each in replies] if len(sent) == 1 else []
+            return True
+
+        def wait(self, timeout_s):
+            time.sleep(0 if self._ready else min(timeout_s, 0.01))
+            return bool(self._ready)
+
+        def receive(self):
+            ready, self._ready = self._ready, []
+            self.frames = bytearray().join(
+                FRAME.pack(0x585, len(each), each.ljust(8, b"\0")[:8]) for each in ready
+            )
+            return len(ready)
+
+    client = SdoClient(Served(), 5, 0.1, 0.05)
+    with pytest.raises(SdoTimeout) as caught:
+        client.read(0x1000, 0)
+    assert str(caught.value) == "no answer within 0.1 s" + (f"; refused {words}" if words else "")
+    error = NodeObjects(Answers({(0x1000, 0): caught.value}), 5)
+    with pytest.raises(BootError) as boot:
+        error.number((0x1000, 0), 4)
+    assert str(boot.value) == "node 5: no answer to SDO 1000h:0 within 0.1 s" + (
+        words and f"; refused {words}"
+    )
+    assert boot.value.found == (words or "none")
+
+
 def test_silence_is_asked_again_and_then_given_up():
     exchange = Exchange(0x1000, 0, None, now=0.0, timeout_s=0.3, answer_s=0.1)
     request = [exchange.request]

@@ -21,7 +21,7 @@ DRIVE_EDS, SENSOR_EDS = EDS / "drive.eds", EDS / "torque_sensor.eds"
 
 def without(*keys, eds=DRIVE_EDS, node=5):
     return ObjectStore(
-        [each for each in read_eds(eds, node) if (each.index, each.subindex) not in keys], node
+        [each for each in read_eds(eds, node).entries if (each.index, each.subindex) not in keys], node
     )
 
 
@@ -58,6 +58,35 @@ def test_tpdos_as_they_are():
     assert one == Tpdo(1, 0x185, (0x6064_0020, 0x60E4_0120), on=False)
     assert one.objects == ("6064h:0/32", "60E4h:1/32")
     assert len(tpdos(store)) == 3, "the fourth is not there"
+
+
+def test_bit_7_of_a_mapped_length_is_a_note_and_no_length(tmp_path):
+    """On the bus and in an EDS."""
+    store = without()
+    for sub, word in ((0, 2), (1, 0x6064_00A0), (2, 0x60E4_01A0)):
+        store.set_number(0x1A00, sub, word)
+    found = tpdos(store)
+    assert found[0].words == (0x6064_0020, 0x60E4_0120)
+    assert found[0].note == "TPDO1: taken as 6064h:0/32, 60E4h:1/32, without bit 7 of a length"
+    assert [each.note for each in found[1:]] == ["", ""]
+    text = DRIVE_EDS.read_text()
+    assert text.count("=0x60640020\n") == 1
+    (tmp_path / "maker.eds").write_text(text.replace("=0x60640020\n", "=0x606400A0\n"))
+    eds, usual = survey_of_eds(tmp_path / "maker.eds", 5), survey_of_eds(DRIVE_EDS, 5)
+    assert [each.words for each in eds.tpdos] == [each.words for each in usual.tpdos]
+    assert eds.notes == ["node 5: TPDO2: taken as 6064h:0/32, 606Ch:0/32, without bit 7 of a length"]
+
+
+def test_an_answer_of_another_length_is_no_missing_node(bus, monkeypatch):
+    path, _ = bus
+    monkeypatch.setattr(survey_module, "ANSWER_S", 0.05)
+    monkeypatch.setattr(
+        survey_module, "survey", lambda *_: (_ for _ in ()).throw(SdoTimeout(0.1, "an answer of 6 bytes"))
+    )
+    reader = BusSurvey(path)
+    with pytest.raises(SurveyError, match=r"^node 5: no answer within 0\.1 s; refused an answer of 6 bytes$"):
+        reader.read(5)
+    reader.close()
 
 
 def test_a_sensor():

@@ -207,7 +207,7 @@ def test_child_reads_the_same_entries_as_the_parser_here():
     from jtqd.sim_can import eds_entries
 
     here = {
-        (node, name): eds_entries.read_eds(eds_entries.FOLDER / name, node)
+        (node, name): list(eds_entries.read_eds(eds_entries.FOLDER / name, node).entries)
         for node, name in eds_entries.files_of(2).items()
     }
     eds_entries._cache.clear()

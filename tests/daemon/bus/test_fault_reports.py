@@ -87,7 +87,7 @@ def node(tmp_path: Path) -> tuple[ObjectStore, Snapshot, SnapshotReader]:
     """jtqd's own node beside a snapshot."""
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.8)
     reader = SnapshotReader(tmp_path / "s", supervisor=True)
-    store = ObjectStore(read_eds(JTQD_EDS, 0x20), 0x20)
+    store = ObjectStore(read_eds(JTQD_EDS, 0x20).entries, 0x20)
     OwnNode(store, load_config(None), reader)
     return store, snapshot, reader
 

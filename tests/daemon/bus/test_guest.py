@@ -70,6 +70,33 @@ def test_scaling_and_identity_of_a_dcf(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("section", "refused"),
+    [("2010", False), ("608Fsub1", True), ("6064", False), ("1A00sub1", True), ("1A02sub1", False)],
+)
+def test_an_odd_entry_of_a_dcf_is_a_note_where_nothing_depends_on_it(
+    tmp_path: Path, section: str, refused: bool
+) -> None:
+    text = (Path(__file__).parents[3] / "drivers" / "eds" / "drive.eds").read_text()
+    values = {"1800sub2": 1, "1801sub2": 1, "2010": 7, section: "abc"}
+    for number, words in OBJECTS.items():
+        found = {f"1A0{number - 1}sub{sub}": word for sub, word in enumerate((len(words), *words))}
+        values = {**found, **values}
+    text += "\n[2010]\nDataType=5\nAccessType=rw\n"
+    for title, value in values.items():
+        assert f"[{title}]\n" in text
+        text = text.replace(f"[{title}]\n", f"[{title}]\nParameterValue={value}\n")
+    (tmp_path / "drive.dcf").write_text(text)
+    given = {"6075h": 500, "60E6h:1": 1000, "6091h:1": 100}
+    changes = {"eds": "drive.dcf", "given": given, "tpdos": None}
+    if refused:
+        with pytest.raises((BootError, EdsError), match=rf"\[{section}\]: ParameterValue=abc"):
+            report(tmp_path, changes)
+    else:
+        (note,) = report(tmp_path, changes)["notes"]
+        assert f"[{section}]: ParameterValue=abc" in note
+
+
+@pytest.mark.parametrize(
     ("changes", "heard", "words"),
     [
         ({"tpdos": None}, {}, "node 1: not known: 1A00h (mapping: 'tpdos'): a guest asks no node"),

@@ -242,6 +242,16 @@ def test_whatever_the_meaning_of_the_pdos_depends_on_is_found(
     assert readings <= (1 + len(REPORT["watched"])) * (4 / 3 if signed else 1) + 1
 
 
+def test_bit_7_of_a_mapped_length_is_no_change() -> None:
+    watch = ConfigurationWatch({**REPORT, "signed": False})
+    for _ in range(4):
+        assert answer(watch) is None
+    assert (watch.next().index, watch.next().subindex) == (0x1A00, 1)
+    assert watch.result(frame("a0 00 64 60")) is None
+    assert watch.result(frame("a0 01 e4 60")) is None
+    assert checks_of({**REPORT, "watched": [[0x1A00, 1, 0x6064_00A0]]})[0].expected == 0x6064_0020
+
+
 def test_a_mapping_that_was_changed_needs_a_boot() -> None:
     watch = ConfigurationWatch({**REPORT, "signed": False})
     for _ in range(4):

@@ -49,7 +49,7 @@ GIVEN = Wanted(gear_ratio=101.0, encoder_counts=4096, link_encoder_counts=2**19,
 
 def drive(values=None, without=()):
     """Survey of a drive with these values, and without some objects."""
-    entries = [each for each in read_eds(EDS, NODE) if (each.index, each.subindex) not in without]
+    entries = [each for each in read_eds(EDS, NODE).entries if (each.index, each.subindex) not in without]
     store = ObjectStore(entries, NODE)
     for (index, sub), value in {
         (0x6091, 1): 100,
@@ -287,7 +287,7 @@ def test_a_broken_eds_is_one_line(data, tmp_path, capfd):
     """Also on the file descriptor, as the library's parser writes to stderr by itself."""
     (tmp_path / "bad.eds").write_bytes(data)
     status, out, err = run(capfd, "--node 5 --out", tmp_path / "d", "--from-eds", tmp_path / "bad.eds")
-    assert (status, out, err.count("\n")) == (1 if data else 2, "", 1)
+    assert (status, out, err.count("\n"), err.isascii()) == (1, "", 1, True)
     assert "bad.eds" in err
 
 
@@ -735,3 +735,62 @@ def test_the_mapping_of_a_drive_on_the_bus(tmp_path: Path, capsys: pytest.Captur
     assert report.nodes[1].tpdos == config.joints[0].tpdos
     for each in found:
         moves_as_it_should(each)
+
+
+DCF = EDS.read_text().replace("[6091sub1]\n", "[6091sub1]\nParameterValue=120\n")
+
+
+@pytest.mark.parametrize(
+    ("setups", "options", "expected"),
+    [
+        (["NodeID=11\nBaudrate=500"], "", ([11], 500_000, 0)),
+        (["NodeID=11\nBaudrate=500", "NodeID=12\nBaudrate=500"], "", ([11, 12], 500_000, 0)),
+        (["NodeID=11\nBaudrate=500", ""], "", ([11, 2], 500_000, 1)),
+        (["Baudrate=500"], "", ([1], 500_000, 1)),
+        (["NodeID=11"], "", ([11], 1_000_000, 0)),
+        (["NodeID=11\nBaudrate=500"], "--node 5 --bitrate 250000", ([5], 250_000, 0)),
+    ],
+)
+def test_a_dcf_has_node_bit_rate_and_values(tmp_path, capsys, setups, options, expected):
+    """Expected: nodes, bit rate, node-IDs that are a guess."""
+    files = []
+    for number, setup in enumerate(setups):
+        (tmp_path / f"{number}.dcf").write_text(f"{DCF}\n[DeviceComissioning]\n{setup}\n")
+        files += ["--from-eds", tmp_path / f"{number}.dcf"]
+    status, out, err = run(capsys, f"{options} --json --out", tmp_path / "arm", *files)
+    assert (status, err) == (0, "")
+    config, report = load_config(tmp_path / "arm" / "jtqd.yaml"), json.loads(out)
+    nodes = [each.node_id for each in config.joints]
+    assert (nodes, config.bitrate, sum("node = " in each for each in report["guesses"])) == expected
+    assert [each.joint.gear_ratio for each in config.joints] == [120.0] * len(nodes)
+    assert any("of node 11 by its NodeID, read for node 5" in each for each in report["notes"]) == (
+        nodes == [5]
+    )
+
+
+@pytest.mark.parametrize(
+    ("setups", "expected"),
+    [
+        (["NodeID=11\nBaudrate=500", "NodeID=12\nBaudrate=250"], "found bit rates [250000, 500000]"),
+        (["NodeID=11", "NodeID=11"], "[11, 11] names a node twice"),
+    ],
+)
+def test_dcfs_that_contradict_each_other(tmp_path, capsys, setups, expected):
+    files = []
+    for number, setup in enumerate(setups):
+        (tmp_path / f"{number}.dcf").write_text(f"{DCF}\n[DeviceComissioning]\n{setup}\n")
+        files += ["--from-eds", tmp_path / f"{number}.dcf"]
+    status, _, err = run(capsys, "--out", tmp_path / "arm", *files)
+    assert status == 2
+    assert expected in err
+
+
+def test_an_entry_that_cannot_be_read_is_a_note(tmp_path, capsys):
+    (tmp_path / "maker.eds").write_text(
+        f"{EDS.read_text()}\n[2010]\nObjectType=7\nDataType=5\nDefaultValue=3\n"
+    )
+    status, out, _ = run(
+        capsys, "--node 5 --gear-ratio 100 --out", tmp_path / "arm", "--from-eds", tmp_path / "maker.eds"
+    )
+    assert status == 0
+    assert "[2010]: no AccessType" in out

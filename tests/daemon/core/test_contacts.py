@@ -198,7 +198,7 @@ def test_the_objects_of_the_node_are_what_was_sent(tmp_path: Path, exact: ExactT
     ):
         if contact is not None and contact.pdo:
             exact.turn(loop.cycle, PUSHED + 20)
-        store = ObjectStore(read_eds(JTQD_EDS, 0x20), 0x20)
+        store = ObjectStore(read_eds(JTQD_EDS, 0x20).entries, 0x20)
         OwnNode(store, replace(config, contact=contact), SnapshotReader(loop.path, supervisor=True))
         assert (store.number(0x1802, 1), int.from_bytes(store.read(0x2107, 0), "little")) == expected
         rate = int.from_bytes(store.read(0x2106, 1), "little", signed=True)

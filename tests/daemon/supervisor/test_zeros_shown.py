@@ -74,7 +74,7 @@ def test_the_reason_of_a_degraded_joint(flags: int, reason: str) -> None:
 
 
 def test_they_are_objects_of_the_own_node(snapshot: SnapshotReader) -> None:
-    store = ObjectStore(read_eds(ROOT / "drivers/eds/jtqd.eds", 0x20), 0x20)
+    store = ObjectStore(read_eds(ROOT / "drivers/eds/jtqd.eds", 0x20).entries, 0x20)
     OwnNode(store, load_config(None), snapshot)
     floats = [struct.unpack("<f", store.read(0x220A, sub))[0] for sub in range(1, 8)]
     assert floats == pytest.approx(list(FOUND[:7]))
