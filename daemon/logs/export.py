@@ -38,6 +38,7 @@ from jtqd.daemon.logs.read import (
     topics_of,
 )
 from jtqd.daemon.recording.messages import JOINTS
+from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.files import whole_file
 from jtqd.estimator.text import counted
 
@@ -50,22 +51,18 @@ _EXAMPLES = """examples:
   jtq export dbc run.mcap --out bus.dbc                 as attached to the log
   jtq export dbc --config arm.yaml --out bus.dbc        without a log: integers as the devices send them
 
-exit status: 0 done, 1 failure, 2 usage, 3 done, but cycles with missing values were left out"""
+exit status: 0 done, 1 failure, 2 usage"""
 _DBC = "bus.dbc"
 
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq export`."""
-    result = argparse.ArgumentParser(
-        prog="jtq export",
-        description="Write a log as a table (CSV, Parquet), as lines of candump, or the DBC of its bus.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    description = "Write a log as a table (CSV, Parquet), as lines of candump, or the DBC of its bus."
+    result = command_parser("jtq export", description, _EXAMPLES)
     add = result.add_argument
     add("what", choices=("csv", "parquet", "candump", "dbc"))
     add("logs", nargs="*", type=Path, metavar="LOG", help="parts of one run, or their directory")
-    add("--out", type=Path, metavar="FILE", help="default: standard output (candump and dbc only)")
+    add("--out", type=Path, metavar="FILE", help="- or, of candump and dbc, none: standard output")
     add(
         "--topic",
         metavar="TOPIC",
@@ -95,6 +92,8 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     command = parser()
     options = command.parse_intermixed_args(argv)  # options may stand before the logs
+    if options.out == Path("-"):
+        options.out = Path("/dev/stdout")
     _check_usage(command, options)
     try:
         result = _export(options)
@@ -110,13 +109,13 @@ def main(argv: list[str] | None = None) -> int:
         return 1
     if options.json:
         print(json.dumps(result))
-    elif options.out is not None:
+    elif options.out not in (None, Path("/dev/stdout")):
         print(", ".join(f"{name} {value}" for name, value in result.items()))
     left_out = result.get("left_out", 0)
     if left_out:
         what = f"{counted(left_out, 'cycle')} with a missing value left out (--all-cycles keeps all)"
         print(f"jtq export: {what}", file=sys.stderr)
-    return 3 if left_out else 0
+    return 0
 
 
 def _check_usage(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:
@@ -253,15 +252,22 @@ RUN_FIELDS = {
     "temperature_c": "temperature_c",
 }
 """Column of a joint in a run table -> field of its message. What a run calls torque is measured."""
+_ESTIMATE = {"estimate_nm": "torque_nm", "sigma_nm": "sigma_nm", "status": "status"}
+"""Further columns, which no reader of runs needs and no cycle must have."""
+_FIELDS = RUN_FIELDS | _ESTIMATE
 _ROW = np.dtype(
-    [("cycle", "<u8"), ("sync_monotonic_ns", "<i8"), *((field, "<f8") for field in RUN_FIELDS.values())]
+    [
+        *(("cycle", "<u8"), ("sync_monotonic_ns", "<i8")),
+        *((field, "u1" if field == "status" else "<f8") for field in _FIELDS.values()),
+    ]
 )
 
 
 class RunTable:
     """Run table of a log: `time_s` from its first row on, `j1.current_a` and so on. The log is read twice, chunk by chunk.
 
-    A column without any value is left out, and so is a cycle in which one of the others is missing.
+    A column without any value is left out, and so is a cycle in which a measured one is missing. Before the first frame of
+    a temperature its value holds.
 
     Args:
         path: as for `jtqd.daemon.logs.read_topics`.
@@ -288,39 +294,45 @@ class RunTable:
         self.cycles = self.left_out = 0
         self._path, self._all = path, all_cycles
         self._span: dict[str, Any] = {"start_ns": start_ns, "end_ns": end_ns}
-        there = topics_of(path)
+        names = topics_of(path)
         self._topics = {
-            n: topic.name for n, topic in enumerate(JOINTS, start=1) if n == 1 or topic.name in there
+            n: each.name for n, each in enumerate(JOINTS, start=1) if n == 1 or each.name in names
         }
-        wanted = {f"j{n}.{column}": (n, field) for n in self._topics for column, field in RUN_FIELDS.items()}
-        found: set[str] = set()
+        wanted = {f"j{n}.{column}": (n, field) for n in self._topics for column, field in _FIELDS.items()}
+        found: dict[str, float] = {}
         count = 0
         for rows in self._rows():
             count += len(rows[1])
-            found |= {
-                name
-                for name, (n, field) in wanted.items()
-                if name not in found and np.isfinite(rows[n][field]).any()
-            }
+            for name, (n, field) in wanted.items():
+                if name not in found and len(there := np.flatnonzero(np.isfinite(rows[n][field]))):
+                    found[name] = float(rows[n][field][there[0]])
             if len(found) == len(wanted):
                 break
         if not count:
             when = _when(self._span)
             raise LogError(f"{_named(path)}: found no cycle of the joints{when}, expected one at least")
-        if not found:
+        if all(wanted[name][1] in _ESTIMATE.values() for name in found):
             raise LogError(f"{_named(path)}: found no measured value in {counted(count, 'cycle')}")
         self._wanted = {name: where for name, where in wanted.items() if name in found}
         self.columns = tuple(self._wanted)
+        self._first = {name: value for name, value in found.items() if name.endswith("temperature_c")}
 
     def blocks(self) -> Iterator[Columns]:
         """Yield the table, some rows at a time."""
         self.cycles = self.left_out = 0
         first: int | None = None
+        held = {} if self._all else dict(self._first)
         for rows in self._rows():
             columns = {name: rows[n][field] for name, (n, field) in self._wanted.items()}
+            for name, value in list(held.items()):
+                known = np.cumsum(np.isfinite(columns[name])) > 0
+                columns[name] = np.where(known, columns[name], value)
+                if known[-1]:
+                    del held[name]
             there = np.ones(len(rows[1]), np.bool_)
-            for values in () if self._all else columns.values():
-                there &= np.isfinite(values)
+            for name in () if self._all else self._wanted:
+                if self._wanted[name][1] not in _ESTIMATE.values():
+                    there &= np.isfinite(columns[name])
             self.cycles += len(there)
             self.left_out += int(np.count_nonzero(~there))
             stamps = rows[1]["sync_monotonic_ns"][there]

@@ -27,6 +27,7 @@ import msgspec
 from jtqd.daemon.logs.log_file import Contents, LogError, Source, sealed_chunk
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, SealedChunk, Span
 from jtqd.daemon.recording.run_files import ACTIVE, PartFile, free_bytes, part_files
+from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.files import open_regular
 from jtqd.estimator.text import counted
 
@@ -382,12 +383,8 @@ exit status: 0 nothing lost, 3 recovered with loss, 1 failure, 2 usage"""
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq recover`."""
-    result = argparse.ArgumentParser(
-        prog="jtq recover",
-        description="Recover truncated or damaged logs of jtqd; every intact chunk is kept.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    description = "Recover truncated or damaged logs of jtqd; every intact chunk is kept."
+    result = command_parser("jtq recover", description, _EXAMPLES)
     result.add_argument("logs", nargs="+", type=Path, metavar="FILE|DIR")
     result.add_argument("--json", action="store_true", help="results as JSON on standard output")
     result.add_argument("--dry-run", action="store_true", help="report only, change nothing")

@@ -73,7 +73,7 @@ _WORDS: Final[Mapping[str, tuple[str, ...]]] = {
 COMMAND, MOTOR, LINK, SENSOR, SUPPLY = (
     frozenset(words.split())
     for words in (
-        "cmd command commanded des desired ref reference target setpoint sp goal demand demanded set",
+        "cmd command commanded des desired ref reference target setpoint sp goal demand demanded set estimate sigma",
         "motor mot m rotor input hs fast",
         "link joint l output out load arm lever abs absolute secondary ls",
         "sensor ft measured meas loadcell cell transducer ts",

@@ -255,7 +255,7 @@ def _unusable(guess: Guess) -> str:
     x, words = guess.finite, guess.name.words
     reasons = (
         (not guess.kind, f"no quantity of a joint by its name{guess.unit and f' and unit {guess.unit}'}"),
-        (bool(of.COMMAND & words), "a command, not a measurement"),
+        (bool(of.COMMAND & words), "a command or an estimate, not a measurement"),
         (len(x) < 2, "no finite numbers"),
         (
             guess.kind in _SI and guess.kind != of.TORQUE and of.SUPPLY & words,

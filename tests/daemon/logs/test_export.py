@@ -24,7 +24,9 @@ from jtqd.daemon.logs.export import RunTable, main
 from jtqd.daemon.logs.recover import recover
 from tests.daemon.logs.campaign_log import Cycle, Joint, regular, write_log
 from tests.daemon.logs.log_files import ATTACHMENTS, ours
-from tests.paths import ROOT
+from tests.paths import GOLDEN, ROOT
+
+ORDINARY = GOLDEN / "network.mcap"
 
 CYCLES = 120
 
@@ -107,20 +109,53 @@ def test_run_table_is_what_the_diagnosis_reads(tmp_path, name):
 
 
 def test_cycles_with_missing_values_are_left_out_and_said(tmp_path, capsys):
+    """No failure, as every log has some: they are counted."""
+
     def holes(n):
         one, two = joints(n)
         return (one._replace(current_a=math.nan), two) if n in (3, 4) else (one, two)
 
     log = write_log(tmp_path / "a.mcap", regular(20, holes))
     out = tmp_path / "run.csv"
-    assert main(["csv", str(log), "--out", str(out), "--json"]) == 3
+    assert main(["csv", str(log), "--out", str(out), "--json"]) == 0
     said = capsys.readouterr()
-    assert json.loads(said.out) == {"path": str(out), "rows": 18, "columns": 11, "left_out": 2}
+    assert json.loads(said.out) == {"path": str(out), "rows": 18, "columns": 13, "left_out": 2}
     assert "2 cycles with a missing value left out" in said.err
     assert main(["csv", str(log), "--out", str(out), "--all-cycles"]) == 0
     rows = list(csv.DictReader(out.open()))
     assert len(rows) == 20
     assert [row["j1.current_a"] for row in rows[2:6]] == ["0.2", "", "", "0.5"]
+
+
+def test_an_ordinary_log_has_its_estimate_and_loses_no_cycle_to_what_comes_late(tmp_path, capsys):
+    """The first temperature comes after some cycles, and the estimate is not there in all; neither costs a row."""
+    state = read_topic(ORDINARY, "/joint/1/state")
+    late = int(np.argmax(np.isfinite(state["temperature_c"])))
+    known = np.isfinite(state["torque_nm"])
+    assert 0 < late < known.sum() < len(state)
+    whole = np.all(
+        [np.isfinite(state[name]) for name in ("current_a", "link_position_rad", "sensor_torque_nm")], axis=0
+    )
+    assert main(["csv", str(ORDINARY), "--out", str(tmp_path / "a.csv"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["left_out"] <= np.count_nonzero(~whole) + 1
+    rows = list(csv.DictReader((tmp_path / "a.csv").open()))
+    assert rows[0]["j1.temperature_c"] == str(state["temperature_c"][late])
+    torques = state["torque_nm"][np.isfinite(state["torque_nm"])]
+    assert {float(row["j1.estimate_nm"]) for row in rows if row["j1.estimate_nm"]} <= set(torques.tolist())
+    assert sum(not row["j1.estimate_nm"] for row in rows) > 0
+    assert {row["j1.status"] for row in rows} <= {str(each) for each in range(8)}
+    assert main(["csv", str(ORDINARY), "--out", str(tmp_path / "b.csv"), "--all-cycles"]) == 0
+    rows = list(csv.DictReader((tmp_path / "b.csv").open()))
+    assert [row["j1.temperature_c"] for row in rows[: late + 1]].count("") == late, "nothing is filled in"
+
+
+def test_a_dash_is_standard_output(log, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["csv", str(log), "--out", "a.csv"]) == 0
+    piped = run(sys.executable, "-m", "jtqd.daemon.jtq", "export", "csv", log, "--out", "-")
+    assert piped.stdout == (tmp_path / "a.csv").read_text()
+    assert [each.name for each in tmp_path.iterdir()] == ["a.csv"]
 
 
 def test_every_field_of_a_topic(log, tmp_path):
