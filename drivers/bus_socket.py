@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import re
 import socket
 import struct
 from collections.abc import Iterable, Iterator, Sequence
@@ -272,14 +273,13 @@ def open_socketcan(
     Binding to an interface that is down succeeds, and the first receive then fails with ENETDOWN.
     Raises BusError: no CAN in this kernel, no such interface, not a CAN interface, or another error of bind.
     """
+    if not re.fullmatch(r"[^\s/:]{1,15}", interface):
+        raise BusError(f"{interface}: found no bus, expected the name of a CAN interface, or unix:PATH")
     try:
         sock = socket.socket(AF_CAN, socket.SOCK_RAW, CAN_RAW)
     except OSError as error:
-        if error.errno in _NO_CAN:
-            raise BusError(
-                f"{interface}: this kernel has no CAN (AF_CAN, errno {error.errno}); use unix:PATH instead"
-            ) from None
-        raise BusError(f"{interface}: {error}") from None
+        no_can = f"this kernel has no CAN (AF_CAN, errno {error.errno}); use unix:PATH instead"
+        raise BusError(f"{interface}: {no_can if error.errno in _NO_CAN else error}") from None
     try:
         set_can_filters(sock, filters)
         sock.setsockopt(SOL_CAN_RAW, CAN_RAW_RECV_OWN_MSGS, int(receive_own))

@@ -265,6 +265,15 @@ def test_filters_that_no_transport_knows_are_refused(bench):
 # --- failures a test cannot bring about on every kernel ---
 
 
+@pytest.mark.parametrize(
+    "bus", ["foo:bar", "udp:1", "UNIX:/run/bus", "/run/bus", "can 0", "can0123456789abc"]
+)
+def test_a_name_that_no_interface_can_have_is_no_question_of_the_kernel(bus):
+    with pytest.raises(BusError) as caught:
+        open_frame_socket(bus, None)
+    assert str(caught.value) == f"{bus}: found no bus, expected the name of a CAN interface, or unix:PATH"
+
+
 @pytest.mark.parametrize("number", [errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT])
 def test_kernel_without_can_is_one_line(monkeypatch, number):
     def refuse(*_arguments):
