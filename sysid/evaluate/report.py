@@ -179,7 +179,7 @@ def text_lines(result: Evaluation, mapping: Mapping[str, Any]) -> list[str]:
         *_text_intervals(result),
         "",
         *_text_truth(result),
-        "D. targets",
+        "D. targets of the paper's bench",
     ]
     rows = [[each.figure, each.paper, each.goal, each.ours, _MARKS[each.reached]] for each in result.targets]
     lines += indented_table(["figure", "paper", "target", "ours", "met"], rows)

@@ -23,9 +23,12 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.models.files import load_joint
 from jtqd.sysid.evaluate.command import main
+from jtqd.sysid.evaluate.evaluation import Target
+from jtqd.sysid.evaluate.report import as_mapping, report_html
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.tables import write_run
 from tests.sysid.evaluate.evaluate_helpers import NO_PICTURES, evaluate, report
+from tests.sysid.evaluate.test_evaluation import EMPTY
 
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
@@ -43,6 +46,23 @@ def judged(bench: Path) -> tuple[dict[str, Any], str]:
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only `judged`, which is made before this, draws."""
     monkeypatch.setattr("jtqd.sysid.evaluate.report.pictures", lambda result: NO_PICTURES)
+
+
+@pytest.mark.parametrize(
+    ("states", "words"),
+    [
+        ((None, None), "These runs decide no target of the paper's bench</strong>:"),
+        ((None, False), "0 of 1 targets of the paper's bench reached</strong>, 1 not known from these runs:"),
+        ((True, False), "1 of 2 targets of the paper's bench reached</strong>:"),
+    ],
+)
+def test_a_target_that_runs_do_not_decide_is_not_missed(states: tuple[bool | None, ...], words: str) -> None:
+    """Those of one's own joint: the targets have the torques of another."""
+    rows = tuple(Target(f"k{n}", "figure", "-", "at most 1", "2", each) for n, each in enumerate(states))
+    result = replace(EMPTY, targets=rows)
+    text = report_html(result, as_mapping(result), "made by a test")
+    assert words in text.replace("&#39;", "'")
+    assert 'class="box warn"' not in text
 
 
 def by_hand(bench: Path, name: str, number: int) -> dict[str, tuple[float, int]]:
@@ -283,6 +303,8 @@ import sys
 from jtqd.estimator import settings
 settings.METHODS["twin"] = settings.Method("twin of the classical TOB", "JointEstimator")
 from jtqd.sysid.evaluate.command import main
+from jtqd.sysid.evaluate.evaluation import Target
+from jtqd.sysid.evaluate.report import as_mapping, report_html
 sys.exit(main(sys.argv[1:]))
 """
 
