@@ -32,19 +32,13 @@ GROUPS = {
         "layout": ("jtqd.daemon.live.layout", "write a layout file for Foxglove and Lichtblick"),
     },
     "log: recorded cycles": {
-        "export": (
-            "jtqd.daemon.logs.export",
-            "write a log as CSV, Parquet or candump lines, or the bus as a DBC",
-        ),
+        "export": ("jtqd.daemon.logs.export", "write a log as CSV, Parquet or candump lines; a DBC"),
         "recover": ("jtqd.daemon.logs.recover", "repair unfinished or damaged logs"),
         "replay": ("jtqd.daemon.replay.command", "run the estimator again over a log, and compare"),
         "batch": ("jtqd.sysid.batch.command", "diagnose or replay many logs, here or on a dask cluster"),
     },
     "identify: parameters and networks from measured runs": {
-        "campaign": (
-            "jtqd.sysid.campaign.command",
-            "move the joints of a bus through a campaign of runs, and record them",
-        ),
+        "campaign": ("jtqd.sysid.campaign.command", "move the joints of a bus, and record the runs"),
         "excitation": ("jtqd.sysid.planner.command", "design excitation trajectories"),
         "fit": ("jtqd.sysid.fit.command", "fit efficiency, friction or losses of a joint file to runs"),
         "train": ("jtqd.sysid.train.command", "train a network per joint on runs (extra: train)"),
@@ -54,7 +48,7 @@ GROUPS = {
         ),
         "diagnose": (
             "jtqd.sysid.diagnosis.command",
-            "find the cause of the simulation error on runs, and extend the joint file",
+            "find the cause of a simulation error, and extend the joint file",
         ),
         "score": ("jtqd.sysid.score.command", "print the error of a joint file on runs, before and after"),
         "export-model": ("jtqd.sysid.simulators", "write a joint file for other simulators: MJCF, URDF"),

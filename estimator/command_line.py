@@ -7,6 +7,7 @@ import importlib.util
 import math
 import os
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any, Final, TextIO
 
@@ -15,13 +16,31 @@ from jtqd.estimator.text import printable
 
 
 def command_parser(prog: str, description: str, examples: str) -> argparse.ArgumentParser:
-    """Return a parser without arguments; examples: epilog of its help, printed as it is."""
+    """Return a parser without arguments; examples: epilog of its help, printed line by line."""
     return argparse.ArgumentParser(
-        prog=prog,
-        description=description,
-        epilog=examples,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        prog=prog, description=description, epilog=examples, formatter_class=HelpFormatter
     )
+
+
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Help whose lines fit the terminal: a longer one goes on below, and so does the remark behind a command."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return "\n".join(each for line in text.splitlines() for each in _folded(indent + line, width))
+
+
+def _folded(line: str, width: int) -> list[str]:
+    if len(line) <= width:
+        return [line]
+    at = len(line) - len(line.lstrip())
+    text, _, remark = line[at:].partition("  ")
+    below = " " * (at + 4 if at else 0)
+    lines = textwrap.wrap(
+        text, width - 2, initial_indent=" " * at, subsequent_indent=below, break_on_hyphens=False
+    )
+    goes_on = " \\" if text.startswith(("jtq", "python")) else ""
+    lines = [each + goes_on for each in lines[:-1]] + lines[-1:]
+    return lines + textwrap.wrap(remark.strip(), width, initial_indent=below, subsequent_indent=below)
 
 
 class _PrintableStream:

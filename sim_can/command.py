@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jtqd.estimator.command_line import count, natural, seconds
+from jtqd.estimator.command_line import command_parser, count, natural, seconds
 from jtqd.estimator.errors import ConfigError
 from jtqd.sim_can.eds_entries import EdsChild
 
@@ -42,13 +42,11 @@ def _joints(text: str) -> tuple[int, int]:
 
 def parser() -> argparse.ArgumentParser:
     """Return the options of `jtq sim`."""
-    made = argparse.ArgumentParser(
-        prog="jtq sim",
-        description="Emulated bench: two drives (nodes 1, 2) and a torque sensor (node 3) on a CAN bus, "
-        "or one to four drives (nodes 1 to 4; with more than two the sensor is node 5).",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    description = (
+        "Emulated bench: two drives (nodes 1, 2) and a torque sensor (node 3) on a CAN bus, "
+        "or one to four drives (nodes 1 to 4; with more than two the sensor is node 5)."
     )
+    made = command_parser("jtq sim", description, EXAMPLES)
     made.add_argument(
         "--bus", help="SocketCAN interface (vcan0) or unix:PATH; without a hub on PATH the bench starts one"
     )

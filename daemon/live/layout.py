@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
-from jtqd.estimator.command_line import seconds
+from jtqd.estimator.command_line import command_parser, seconds
 from jtqd.estimator.files import write_whole
 
 _LAYOUTS = Path(__file__).with_name("layouts")
@@ -38,13 +38,11 @@ def layout(follow_s: float | None = None, joints: int = 2) -> dict[str, Any]:
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq layout`."""
-    result = argparse.ArgumentParser(
-        prog="jtq layout",
-        description="Write the layout file for Foxglove and Lichtblick: torque with its sigma band, residual to the "
-        "sensor, status, stages, inputs, contacts, cycle time, diagnostics and log.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    description = (
+        "Write the layout file for Foxglove and Lichtblick: torque with its sigma band, residual to the sensor, status, "
+        "stages, inputs, contacts, cycle time, diagnostics and log."
     )
+    result = command_parser("jtq layout", description, _EXAMPLES)
     result.add_argument("--out", type=Path, metavar="FILE", help="output file (default: standard output)")
     result.add_argument(
         "--follow", type=seconds, metavar="S", help="plots show the last S seconds (default: everything)"

@@ -21,7 +21,7 @@ from jtqd.daemon.replay.logged import ADDED, SAMPLE, STAMP, stamps_ns
 from jtqd.daemon.replay.session import Result, as_json, content, replay
 from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.estimator.arrays import RecordArray
-from jtqd.estimator.command_line import check_output
+from jtqd.estimator.command_line import check_output, command_parser
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.network import NetworkError
 from jtqd.estimator.settings import METHODS
@@ -240,12 +240,8 @@ exit status: 0 replayed (with the logged models: identical), 1 a log or model ca
 
 def parser() -> argparse.ArgumentParser:
     """Options of `jtq replay`."""
-    made = argparse.ArgumentParser(
-        prog="jtq replay",
-        description="Run the estimator again over the inputs of a log, and compare with the published values.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    description = "Run the estimator again over the inputs of a log, and compare with the published values."
+    made = command_parser("jtq replay", description, _EXAMPLES)
     add = made.add_argument
     add("logs", nargs="+", type=Path, metavar="LOG", help="MCAP files of jtqd, or the directory of one run")
     add(

@@ -37,7 +37,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import jtqd
-from jtqd.estimator.command_line import check_installed, command_parser, count, make_directory, seconds
+from jtqd.estimator.command_line import (
+    HelpFormatter,
+    check_installed,
+    command_parser,
+    count,
+    make_directory,
+    seconds,
+)
 from jtqd.estimator.decoder import read_json
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.files import open_regular, write_whole
@@ -737,7 +744,7 @@ def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
         help=text,
         description=text,
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     add = made.add_argument
     add("logs", nargs="+", type=Path, metavar="LOGS", help="logs, or directories of them")

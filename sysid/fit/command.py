@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from jtqd.estimator.command_line import check_installed, check_output, command_parser
+from jtqd.estimator.command_line import HelpFormatter, check_installed, check_output, command_parser
 from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import CONVENTIONS, QUADRANTS, Joint
@@ -125,7 +125,7 @@ def parser() -> argparse.ArgumentParser:
             help=kind.help,
             description=kind.description,
             epilog=f"examples:\n{kind.examples}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            formatter_class=HelpFormatter,
         )
         add = own.add_argument
         add_runs(own)

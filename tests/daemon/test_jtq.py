@@ -1,5 +1,7 @@
 """`jtq`: version, unknown commands, and how it ends: a closed pipe, Ctrl-C; options before a log."""
 
+import argparse
+import importlib
 import importlib.util
 import itertools
 import os
@@ -15,6 +17,7 @@ import pytest
 import jtqd
 from jtqd.daemon import jtq
 from jtqd.daemon import jtqd as daemon
+from jtqd.estimator.command_line import command_parser
 from tests.paths import GOLDEN
 
 LOG = GOLDEN / "network.mcap"
@@ -69,6 +72,40 @@ def test_no_help_loads_a_large_library():
         [sys.executable, "-c", HELP], capture_output=True, text=True, check=False, timeout=120
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def _helps(parser):
+    """Help of a parser and of all below it."""
+    yield parser.prog, parser.format_help()
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                yield from _helps(below)
+
+
+def test_no_help_is_wider_than_a_terminal(monkeypatch):
+    """Of 80 columns, which nobody has drawn larger; the lines of examples too."""
+    columns = 80
+    monkeypatch.setenv("COLUMNS", str(columns))
+    modules = [module for module, _ in jtq.COMMANDS.values()] + [*jtq.FORMS.values()]
+    parsers = [importlib.import_module(module).parser() for module in modules]
+    helps = [one for each in (*parsers, daemon.parser()) for one in _helps(each)]
+    assert len(helps) > len(modules) + 5, "subcommands are among them"
+    wide = [f"{prog}: {line}" for prog, text in helps for line in text.splitlines() if len(line) > columns]
+    assert wide == []
+    assert max(map(len, jtq._help().splitlines())) <= columns
+
+
+def test_a_command_that_goes_on_below_is_still_one_command():
+    folded = command_parser(
+        "x", "", "  jtq init --bus can0 " + "--node 1 " * 12 + "  all of them\n"
+    ).format_help()
+    command = folded.partition("  jtq")[2].rpartition("\n")[0]
+    assert (
+        "jtq" + command.replace(" \\\n      ", " ").partition("\n")[0]
+        == "jtq init --bus can0" + " --node 1" * 12
+    )
+    assert command.endswith("\n      all of them")
 
 
 def test_an_option_can_have_a_module_of_its_own(capsys):

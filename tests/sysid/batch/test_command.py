@@ -400,7 +400,8 @@ def test_help_has_examples(capsys):
         with pytest.raises(SystemExit) as left:
             jtq(["batch", *argv])
         assert left.value.code == 0
-        assert "--scheduler tcp://10.0.0.5:8786" in capsys.readouterr().out
+        shown = " ".join(capsys.readouterr().out.replace("\\\n", " ").split())
+        assert "--scheduler tcp://10.0.0.5:8786" in shown
 
 
 def diagnosis(verdict="cause", rmse=1.25, *causes):
