@@ -16,6 +16,7 @@ from tests.paths import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 IDS = [page.name for page in PAGES]
+CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 FILE = re.compile(
     r"`((?:daemon|drivers|estimator|examples|models|sim_can|sysid|systemd|tests|tools|validation)/[\w./-]*\.(?:py|pyx|pxd|yaml|sh|c|md|csv|csv\.gz|service))[:`]"
 )
@@ -27,12 +28,19 @@ IMPORT = re.compile(
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=IDS)
+@pytest.mark.parametrize("page", [*PAGES, CONTRIBUTING], ids=[*IDS, CONTRIBUTING.name])
 def test_files_and_links_are_there(page: Path) -> None:
     text = page.read_text()
     missing = [name for name in FILE.findall(text) if not (ROOT / name).exists()]
     missing += [link for link, _ in LINK.findall(text) if link and not (page.parent / link).exists()]
     assert not missing
+
+
+def test_the_targets_that_a_contributor_is_told_are_there() -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    told = re.findall(r"^    make ([\w -]+?)(?:  |$)", CONTRIBUTING.read_text(), re.MULTILINE)
+    assert len(told) >= 4
+    assert [each for line in told for each in line.split() if f"\n{each}:" not in makefile] == []
 
 
 HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
