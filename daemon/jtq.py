@@ -25,6 +25,7 @@ GROUPS = {
             "jtqd.daemon.cli.doctor",
             "examine kernel, rights, CAN interface and files of this machine",
         ),
+        "schema": ("jtqd.daemon.cli.schema", "print the JSON schema of a configuration, joint file or plan"),
         "bus-load": ("jtqd.daemon.cli.bus_load", "compute the worst-case bus load of a configuration"),
     },
     "look: figures and layouts": {

@@ -342,6 +342,30 @@ class Field:
                 expected += f" and at most {_LARGEST:g} in magnitude"
         raise FieldError("", key, found, expected)
 
+    def schema(self) -> dict[str, Any]:
+        """Return the JSON schema of the key's value as it is read."""
+        found: dict[str, Any] = {"description": self.expected}
+        if self.form == "section":
+            found |= json_schema(self.inner)
+        elif self.form == "list":
+            inner = {"type": "object"} if self.inner is None else json_schema(self.inner)
+            found |= {"type": "array", "items": inner}
+        elif self.form == "mapping":
+            inner = {} if self.inner is None else {"additionalProperties": self.inner.schema()}
+            found |= {"type": "object", **inner}
+        elif self.choices:
+            found["enum"] = [*self.choices]
+        elif self.parse is None:
+            text = msgspec.json.encode(msgspec.json.schema(self.hint))
+            found |= msgspec.json.decode(
+                text.replace(rb"\\A", b"^").replace(rb"\\Z", b"$")
+            )  # Python's own anchors
+        others: list[Any] = (
+            [{"type": "null"}] if self.nullable or (self.optional and self.form != "value") else []
+        )
+        others += [{"const": False}] if self.none_by_false else []
+        return {"anyOf": [found, *others]} if others else found
+
     def holds(self, value: Any) -> bool:
         """Return whether a number or choice keeps the annotation."""
         node = self.node
@@ -360,6 +384,17 @@ class Field:
             and (node.gt is None or value > node.gt)
             and (node.le is None or value <= node.le)
         )
+
+
+def json_schema(kind: Any, *given: str) -> dict[str, Any]:
+    """Return the JSON schema of what `read` takes, but for what the dataclass refuses; given: fields that are no keys."""
+    known = [each for each in _fields_of(kind) if each.name not in given]
+    return {
+        "type": "object",
+        "properties": {each.name: each.schema() for each in known},
+        "required": [each.name for each in known if not each.optional],
+        "additionalProperties": False,
+    }
 
 
 def _nested(kind: Any, value: object, key: str) -> Any:

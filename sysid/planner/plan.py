@@ -34,6 +34,7 @@ from jtqd.estimator.decoder import (
     check,
     choice,
     in_file,
+    json_schema,
     limits,
     parsed,
     read,
@@ -576,6 +577,34 @@ class _PlanFile:
             for each in self.alone
         }
         return Plan(self.name, Limits(**vars(self.limits) | {"temperature_c": celsius}), tuple(runs), alone)
+
+
+def plan_schema() -> dict[str, Any]:
+    """Return the JSON schema of a plan as `Plan.from_mapping` reads it."""
+
+    def segments(*, alone: bool) -> dict[str, Any]:
+        kinds = {
+            name: json_schema(kind, *(["current_a"] if alone else []))
+            for name, kind in _KINDS.items()
+            if not (alone and kind is Off) and kind is not Fourier
+        }
+        file = json_schema(_FourierFile, *(["current"] if alone else []))
+        series = {"velocity": FourierTrajectory} | ({} if alone else {"current": FourierSeries})
+        file["properties"] |= {name: json_schema(kind, "duration_s") for name, kind in series.items()}
+        kinds["fourier"] = file
+        for name, each in kinds.items():
+            each["properties"]["kind"] = {"const": name}
+            each["required"].append("kind")
+        return {"type": "array", "minItems": 1, "items": {"anyOf": [*kinds.values()]}}
+
+    runs = [json_schema(each) for each in (_AloneRun, _PairRun)]
+    for each, alone in zip(runs, (True, False), strict=True):
+        each["properties"]["segments"] = segments(alone=alone)
+        each["required"].append("segments")
+    plan = json_schema(_PlanFile)
+    plan["properties"]["runs"] = {"type": "array", "minItems": 1, "items": {"anyOf": runs}}
+    plan["required"].append("runs")
+    return plan
 
 
 # Set-points -----------------------------------------------------------------------------------------------------
