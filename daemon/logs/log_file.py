@@ -30,11 +30,13 @@ from mcap.records import (
     ChunkIndex,
     Footer,
     Header,
+    Message,
     Metadata,
     MetadataIndex,
     Schema,
     Statistics,
 )
+from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from numpy.typing import NDArray
 
@@ -61,6 +63,8 @@ MESSAGE_BODY = MESSAGE_HEAD.itemsize - HEAD.size
 _MESSAGE_INDEX_ENTRY = 16
 """[byte] the least that a message takes of a file."""
 _FOOTER_SIZE = HEAD.size + 20
+_TOGETHER = 1 << 20
+"""[byte] messages outside of chunks that are made one array."""
 _U2, _U4, _U8 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 
 
@@ -321,7 +325,7 @@ class LogFile:
         expected: messages of each channel by the summary, as far as the file is long enough for them.
 
     Raises:
-        LogError: no MCAP file, one that ends too early and is not called `.active`, or messages outside chunks.
+        LogError: no MCAP file, or one that ends too early and is not called `.active`.
         OSError: it cannot be read, or is no regular file.
     """
 
@@ -340,6 +344,7 @@ class LogFile:
         if source.read(0, len(MAGIC)) != MAGIC:
             raise self._error("its first bytes are not MCAP's")
         self.expected: dict[int, int] = {}
+        self._outside, self._first_ns = False, 0
         found = read_summary(source)
         if found is not None:
             summary, _ = found
@@ -350,8 +355,8 @@ class LogFile:
                 most = source.size // _MESSAGE_INDEX_ENTRY
                 counts = statistics.channel_message_counts
                 self.expected = {channel: min(count, most) for channel, count in counts.items()}
-            if not self._chunks and (statistics is None or statistics.message_count):
-                raise self._error("found no index of chunks, expected every message in one (`mcap compress`)")
+                self._first_ns = int(statistics.message_start_time)
+            self._outside = not self._chunks and (statistics is None or statistics.message_count > 0)
         elif self.path.suffix == ACTIVE:
             contents = Contents(source)
             self.schemas, self.channels = contents.schemas, contents.channels
@@ -380,7 +385,7 @@ class LogFile:
     @property
     def start_ns(self) -> int:
         """First log time; 0 without messages."""
-        return min((int(chunk.message_start_time) for chunk in self._chunks), default=0)
+        return min((int(chunk.message_start_time) for chunk in self._chunks), default=self._first_ns)
 
     def batches(
         self, channels: Collection[int], start_ns: int | None = None, end_ns: int | None = None
@@ -398,6 +403,9 @@ class LogFile:
         wanted = set(channels)
         first = 0 if start_ns is None else start_ns
         last = (1 << 64) - 1 if end_ns is None else end_ns - 1
+        for batch in self._without_index() if self._outside else ():
+            if batch.channel in wanted:
+                yield batch.only((batch.log_times >= first) & (batch.log_times <= last))
         for chunk in self._chunks:
             indexed = chunk.message_index_offsets
             if chunk.message_end_time < first or chunk.message_start_time > last:
@@ -409,6 +417,26 @@ class LogFile:
                 if batch.channel in wanted:
                     inside = (batch.log_times >= first) & (batch.log_times <= last) if not whole else None
                     yield batch if inside is None else batch.only(inside)
+
+    def _without_index(self) -> Iterator[Batch]:
+        """Yield all messages of a file without an index of chunks as the library reads it; they may be outside of chunks."""
+        with open(os.dup(self._descriptor), "rb") as file:
+            file.seek(0)
+            outside: list[Message] = []
+            size = 0
+            try:
+                for record in StreamReader(file, emit_chunks=True, record_size_limit=MAX_CHUNK).records:
+                    if isinstance(record, Chunk):
+                        yield from batches_of(self._source.unpack(record))
+                    if isinstance(record, Message):
+                        outside.append(record)
+                        size += len(record.data)
+                    if size > _TOGETHER:
+                        yield from batches_of(bytes_of(*outside))
+                        outside, size = [], 0
+                yield from batches_of(bytes_of(*outside)) if outside else ()
+            except (McapError, ChunkError, struct.error) as error:
+                raise self._error(f"{error} (byte {file.tell()})") from None
 
     def _batches_of(self, index: ChunkIndex) -> list[Batch]:
         at, length = index.chunk_start_offset, index.chunk_length

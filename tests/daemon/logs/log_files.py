@@ -8,7 +8,7 @@ import can
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 
 from jtqd.daemon.logs.can_io import McapCanWriter
 from jtqd.daemon.recording.mcap_file import NamedData
@@ -35,11 +35,12 @@ def ours(path, count=120, chunk_ns=20_000_000, seed=1, *, together=False):
     return path.read_bytes()
 
 
-def foreign(compression="zstd", *, chunked=True, count=400, finish=True):
+def foreign(compression="zstd", *, chunked=True, count=400, finish=True, indexed=True):
     """A log by the mcap library: three topics of changing length, an attachment and metadata."""
     buffer = io.BytesIO()
     kind = {"": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}[compression]
-    writer = Writer(buffer, chunk_size=4096, compression=kind, use_chunking=chunked)
+    indexes = IndexType.ALL if indexed else IndexType.NONE
+    writer = Writer(buffer, chunk_size=4096, compression=kind, use_chunking=chunked, index_types=indexes)
     writer.start("x", "lib")
     schema = writer.register_schema("a/B", "ros2msg", b"int64 a\nstring b\n")
     channels = [writer.register_channel(f"/t{n}", "cdr", schema) for n in range(3)]

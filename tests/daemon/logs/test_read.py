@@ -1,5 +1,6 @@
 """Reading logs: fixed rows against the library's decoder, messages of other writers, parts, unfinished and lying files."""
 
+import io
 import json
 import os
 import resource
@@ -7,12 +8,14 @@ import shutil
 import struct
 import subprocess
 import sys
+import tracemalloc
 import zlib
 
 import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Schema
@@ -35,7 +38,7 @@ from jtqd.daemon.logs import (
 from jtqd.daemon.logs.export import main as export
 from jtqd.daemon.logs.log_file import ChunkError, LogFile, Source
 from jtqd.daemon.logs.read import iter_frames
-from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile
+from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, bytes_of
 from jtqd.daemon.replay.command import main as replay
 from jtqd.daemon.replay.session import replay as replayed
 from tests.daemon.logs.log_files import ATTACHMENTS, cycles, foreign, ours, record_starts, write_log
@@ -110,13 +113,48 @@ def test_foreign_files_with_texts_of_any_length(tmp_path, kind):
         )
 
 
-def test_messages_outside_chunks_are_refused(tmp_path):
+@pytest.mark.parametrize("chunked", [False, True])
+@pytest.mark.parametrize("kind", ["", "lz4", "zstd"])
+def test_messages_without_an_index_of_chunks_are_read(tmp_path, kind, chunked):
+    """Outside of chunks `ros2 bag record` writes them with its preset `fastwrite`."""
     path = tmp_path / "a.mcap"
-    path.write_bytes(foreign("", chunked=False))
-    with pytest.raises(
-        LogError, match=r"found no index of chunks, expected every message in one \(`mcap compress`\)"
-    ):
+    path.write_bytes(foreign(kind, chunked=chunked, count=6000, indexed=False))
+    for topic in ("/t0", "/t2"):
+        found, expected = read_messages(path, (topic,))[topic], by_library(path, topic)
+        assert len(expected) == 2000
+        assert found.log_times.tolist() == [time for time, _ in expected]
+        assert all(same(*pair) for pair in zip(found.records, [each for _, each in expected], strict=True))
+    some = read_messages(path, ("/t0",), start_ns=3_000_000, end_ns=9_000_000)["/t0"]
+    assert some.log_times.tolist() == [3_000_000, 6_000_000]
+
+
+def test_a_bomb_in_a_chunk_without_an_index_takes_no_memory(tmp_path):
+    whole = foreign("", count=6000, indexed=False)
+    chunks = [at for at in record_starts(whole) if whole[at] == Opcode.CHUNK]
+    begin, end = chunks[0], chunks[-1]
+    chunk = Chunk.read(ReadDataStream(io.BytesIO(whole[begin + 9 :])))
+    chunk.data, chunk.compression = zstandard.ZstdCompressor().compress(bytes(1 << 30)), "zstd"
+    room = end - begin - len(bytes_of(chunk)) - 9
+    private = bytes([0x80]) + room.to_bytes(8, "little") + bytes(room)
+    (tmp_path / "a.mcap").write_bytes(whole[:begin] + bytes_of(chunk) + private + whole[end:])
+    tracemalloc.start()
+    with pytest.raises(LogError, match="found 1073741824 bytes unpacked in its frame"):
+        read_topic(tmp_path / "a.mcap", "/t0")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 64 << 20
+
+
+@pytest.mark.parametrize("cut", [1, 40, 5000])
+def test_a_file_without_chunks_that_lies_is_one_line(tmp_path, cut):
+    data = bytearray(foreign("", chunked=False, count=50))
+    starts = [at for at in record_starts(bytes(data)) if data[at] == Opcode.MESSAGE]
+    data[starts[10] + 1 : starts[10] + 9] = (cut * 1000).to_bytes(8, "little")
+    path = tmp_path / "a.mcap"
+    path.write_bytes(bytes(data))
+    with pytest.raises(LogError) as error:
         read_topic(path, "/t0")
+    assert str(error.value).count("\n") == 0
 
 
 MIXED = """\
