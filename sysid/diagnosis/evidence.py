@@ -12,9 +12,9 @@ Assoc. 88: spike and slab):
 
     2 log evidence = b' (A_SS + 1)^-1 b - log |A_SS + 1| + 2 sum log odds
 
-Beside a set the discrepancy has no part along the set's columns (Plumlee 2017, J. Am. Stat. Assoc. 112). As much of each
-entry as it nevertheless resembles is a second, small prior of every entry (George and McCulloch's spike of a width): a set
-needs more evidence than such a discrepancy would give it.
+Beside a set the discrepancy has no part along the columns of the set and of the values of the file (Plumlee 2017, J. Am.
+Stat. Assoc. 112). As much of each entry as it nevertheless resembles is a second, small prior of every entry (George and
+McCulloch's spike of a width): a set needs more evidence than such a discrepancy would give it, and no size is less for it.
 
 The response of each balance has weight one, so no set gains by scaling a balance. What noise of torques and motion puts into
 the columns is taken out of the normal equations (Fuller 1987, Measurement Error Models), once for all sets.
@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -101,7 +100,7 @@ def _within(inner: FloatArray, right: FloatArray, low: FloatArray, high: FloatAr
 
 
 class Means(NamedTuple):
-    """Of coefficients [q], shared discrepancy [k], each recording's own [r][N]; turned: of `Equations.beside` [q, k]."""
+    """Of coefficients [q], shared discrepancy [k], each recording's own [r][N]; turned: of all coefficients in it [E, k]."""
 
     beta: FloatArray
     shared: FloatArray
@@ -340,7 +339,7 @@ class Equations:
     ) -> None:
         self.entries, self.groups, self.shared = list(entries), groups, shared
         self.recorded = np.zeros(sum(e.size for e in entries))
-        self.plain, self.start, self.most = grams.sum(axis=0), start, most
+        self.start, self.most = start, most
         parts = [without_noise(*each) for each in zip(grams, noise, strict=True)]
         self.grams, self.noise = (np.array(x) for x in zip(*parts, strict=True))
         self.E, self.N = sum(e.size for e in entries), len(groups)
@@ -349,8 +348,13 @@ class Equations:
         self._inner = np.arange(self.E, self.E + self.N)
         self._outer = np.concatenate((np.arange(self.E), self.E + shared, [self.E + self.N])).astype(np.intp)
         self.rows = rows
-        self.turned = np.empty((0, len(shared)))
+        self.values: Set = frozenset(k for k, e in enumerate(entries) if e.prior.file)
         self.resemblance = self._resemblance()
+
+    def alike(self, chosen: Set) -> Set:
+        """Return all entries of the slots of a set."""
+        slots = {self.entries[k].slot for k in chosen}
+        return frozenset(k for k, e in enumerate(self.entries) if e.slot in slots)
 
     def _resemblance(self) -> dict[object, FloatArray]:
         """Return per discrepancy the variance of each coefficient [E] that least squares finds in one of unit variance."""
@@ -359,18 +363,15 @@ class Equations:
         many = {g: [self.E + k for k in self.shared.tolist() if self.groups[k] == g] for g in self.most}
         return {g: np.sum((total[f, : self.E] / energy) ** 2, axis=0) for g, f in many.items()}
 
-    def beside(self, chosen: Set) -> Equations:
-        """Return the equations with a discrepancy that has no part along the columns of a set: what a set explains is no
-        discrepancy (Plumlee 2017, J. Am. Stat. Assoc. 112). `turned`: what is taken off, per coefficient of the set [q, k].
+    def _turned(self, total: FloatArray, chosen: Set) -> tuple[FloatArray, FloatArray]:
+        """Return the equations over [E, shared, response] with a discrepancy that has no part along the columns of a set and
+        of the values of the file (Plumlee 2017, J. Am. Stat. Assoc. 112): what these explain is none; and the turn.
         """
-        at, f = columns_of(self.entries, chosen), self.E + self.shared
-        out = copy(self)
-        out.turned = np.linalg.solve(self.plain[np.ix_(at, at)] + np.eye(len(at)), self.plain[np.ix_(at, f)])
-        out.grams, out.noise = self.grams.copy(), self.noise.copy()
-        for each in (out.grams, out.noise):
-            each[:, :, f] -= each[:, :, at] @ out.turned
-            each[:, f, :] -= out.turned.T @ each[:, at, :]
-        return out
+        at, e = columns_of(self.entries, chosen | self.values - self.alike(chosen)), self.E
+        turn = np.eye(len(total))
+        inner = total[np.ix_(at, at)] + np.eye(len(at))
+        turn[at, e : e + len(self.shared)] = -np.linalg.solve(inner, total[at, e : e + len(self.shared)])
+        return turn.T @ total @ turn, turn
 
     def first(self) -> dict[object, float]:
         """Return the variances to begin with."""
@@ -380,10 +381,9 @@ class Equations:
     def sets(self, variances: Variances, chosen: Set = frozenset(), *, resembling: bool = True) -> Sets:
         """Return the sets at these variances, with the discrepancy beside a set; resembling: and what resembles any."""
 
-        here = self.beside(chosen)
-        parts, _, keep = here._reduced(variances)
-        total = np.sum(parts, axis=0)
-        gram, scatter = here._without_shared(total, variances)[0], here._scatter(total, keep, variances)
+        parts, _, keep = self._reduced(variances)
+        total, turn = self._turned(np.sum(parts, axis=0), chosen)
+        gram, scatter = self._without_shared(total, variances)[0], self._scatter(total, turn, keep, variances)
         gram = self._without_resemblance(gram, variances) if resembling else gram
         return Sets(self.entries, gram, scatter)
 
@@ -441,7 +441,11 @@ class Equations:
         return total[np.ix_(o, o)] - half.T @ half, log
 
     def _scatter(
-        self, total: FloatArray, keep: Sequence[tuple[FloatArray, FloatArray]], variances: Variances
+        self,
+        total: FloatArray,
+        turn: FloatArray,
+        keep: Sequence[tuple[FloatArray, FloatArray]],
+        variances: Variances,
     ) -> Scatter:
         """Return the noise over [E, response] that is left by what a recording has of its own and by the discrepancy: what
         these explain of a column they explain of its noise.
@@ -453,7 +457,7 @@ class Equations:
 
         whole = np.zeros_like(total)
         for noise, (lower, cross) in zip(self.noise, keep, strict=True):
-            whole += left(noise, self._outer, self._inner, cho_solve((lower, True), cross))
+            whole += turn.T @ left(noise, self._outer, self._inner, cho_solve((lower, True), cross)) @ turn
         w, o = self._places()
         inner = total[np.ix_(w, w)] + np.diag(1.0 / self._shared_variances(variances))
         into = np.asarray(np.linalg.solve(inner, total[np.ix_(w, o)]), np.float64)
@@ -468,18 +472,13 @@ class Equations:
         self, chosen: Set, variances: Variances, steps: int
     ) -> tuple[dict[object, float], float, Means]:
         """Return the variances after `steps` for a set, -2 log marginal likelihood there, and means."""
-        return self.beside(chosen)._expected(chosen, variances, steps)
-
-    def _expected(
-        self, chosen: Set, variances: Variances, steps: int
-    ) -> tuple[dict[object, float], float, Means]:
         at, many, e = columns_of(self.entries, chosen), len(self.shared), self.E
         now = dict(variances)
         ends = zip(_bounds(self.entries), (-math.inf, math.inf), strict=True)
         low, high = (np.append(x[at], np.full(many, none)) for x, none in ends)
         for step in range(steps + 1):
             parts, logs, keep = self._reduced(now)
-            total = np.sum(parts, axis=0)
+            total, turn = self._turned(np.sum(parts, axis=0), chosen)
             q = np.concatenate((at, np.arange(e, e + many))).astype(np.intp)
             w = self._shared_variances(now)
             inner = total[np.ix_(q, q)] + np.diag(np.concatenate((np.ones(len(at)), 1.0 / w)))
@@ -489,14 +488,15 @@ class Equations:
             left = float(total[-1, -1] - 2.0 * theta @ total[q, -1] + theta @ inner @ theta)
             score = left + logs + 2.0 * float(np.sum(np.log(np.diag(lower)))) + float(np.sum(np.log(w)))
             score -= 2.0 * sum(self.entries[k].odds for k in chosen)
-            contrast = np.zeros(e + many + 1)
-            contrast[q], contrast[-1] = -theta, 1.0
+            mine = np.zeros(e + many + 1)
+            mine[q], mine[-1] = -theta, 1.0
+            contrast = turn @ mine
             squares, spread, means = np.zeros(self.N), np.zeros(self.N), []
             for factor, cross in keep:
                 inverse = np.linalg.inv(factor)
                 inverse = inverse.T @ inverse
                 u = inverse @ (cross @ contrast)
-                b = inverse @ cross[:, q]
+                b = inverse @ cross @ turn[:, q]
                 squares += u**2
                 spread += np.diag(inverse) + np.sum(b @ covariance * b, axis=1)
                 means.append(u)
@@ -507,10 +507,10 @@ class Equations:
                     shared = now["shared", g]
                     score += n0 * (math.log(shared) + v0 / shared)
             if step == steps:
-                score += self._scatter(total, keep, now).by_chance(-contrast[:e])
+                score += self._scatter(total, turn, keep, now).by_chance(-mine[:e])
                 break
             now = self._maximised(now, (squares, spread), (theta[len(at) :], np.diag(covariance)[len(at) :]))
-        return now, score, Means(theta[: len(at)], theta[len(at) :], means, self.turned)
+        return now, score, Means(theta[: len(at)], theta[len(at) :], means, -turn[:e, e : e + many])
 
     def _maximised(
         self, now: Variances, own: tuple[FloatArray, FloatArray], shared: tuple[FloatArray, FloatArray]

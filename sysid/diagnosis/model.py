@@ -23,7 +23,7 @@ from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.dataset import Dataset, binned_runs, unpowered_columns, with_readings
 from jtqd.sysid.diagnosis.entries import Entry, entries_of, present_effects, set_state, shapes_of
 from jtqd.sysid.diagnosis.evidence import Equations, Means, Set, Sets, columns_of, slices_of
-from jtqd.sysid.diagnosis.findings import shows_at
+from jtqd.sysid.diagnosis.findings import Present, shows_at
 from jtqd.sysid.diagnosis.regressors import (
     ChannelData,
     Index,
@@ -88,11 +88,34 @@ class Solution:
     disturbed: list[RunData]
     own_means: list[FloatArray]
     sets: Sets
-    columns: int
+    work: _Work
+    noise: Noise
+
+    def settled(self, chosen: Set, variances: Mapping[object, float]) -> Solution:
+        """Return the equations of all entries at currents, torsions and shapes as the simulation with another set has them,
+        its coefficients at these variances; states of the signals stay those of the solution.
+        """
+        work = self.work.copy()
+        work.settle(chosen, self.equations.sets(variances).fit(chosen).mean, self.noise, variances)
+        self.work.set_states()
+        equations = work.equations(self.noise)
+        return replace(
+            self,
+            entries=work.entries,
+            equations=equations,
+            runs=work.runs,
+            disturbed=work.disturbed,
+            work=work,
+        )
 
     def transform(self) -> FloatArray:
         """Return the weights of scaled coefficients in the library's columns [P, E]."""
-        return transform_of(self.entries, self.columns)
+        return self.work.transform()
+
+    @cached_property
+    def plain(self) -> Sets:
+        """Of sizes: what a set explains is the set's, whatever would resemble it."""
+        return self.equations.sets(self.variances, self.chosen, resembling=False)
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -212,7 +235,8 @@ def solve(dataset: Dataset) -> Solution:
         work.disturbed,
         means.own,
         equations.sets(variances, start),
-        work.columns,
+        work,
+        noise,
     )
 
 
@@ -225,8 +249,8 @@ class _Work:
         self.families = len(dataset.families)
         self.columns = dataset.candidates[-1].columns.stop if dataset.candidates else 0
         rng = np.random.default_rng(0)
-        for s in (s for run in (*dataset.signals, *dataset.disturbed) for s in run):
-            set_state(s, ())
+        self.present: list[Present] = []
+        self.set_states()
         self.runs = [replace(run, channels=dict(run.channels)) for run in dataset.runs]
         self.disturbed = binned_runs(dataset.disturbed, dataset.step_s, dataset.candidates, dataset.families)
         names = [run.name for run in self.runs]
@@ -261,6 +285,21 @@ class _Work:
         self._used = {
             k: fields_used(e.effect, e.candidate.term.basis[0], joint) for k, e in enumerate(self.entries)
         }
+
+    def copy(self) -> _Work:
+        """Return work that moves by itself, but for the states of the signals."""
+        out = copy(self)
+        out.entries = list(self.entries)
+        out.runs, out.disturbed = (
+            [replace(run, channels=dict(run.channels)) for run in runs]
+            for runs in (self.runs, self.disturbed)
+        )
+        return out
+
+    def set_states(self) -> None:
+        """Set the states of all signals to the present effects."""
+        for s in (s for run in (*self.dataset.signals, *self.dataset.disturbed) for s in run):
+            set_state(s, self.present)
 
     def file_values(self) -> Set:
         """Return the set of all values of the file, one of each slot."""
@@ -340,13 +379,14 @@ class _Work:
 
     def left(self, chosen: Set, means: Means) -> dict[Channel, list[FloatArray]]:
         """Return what set, discrepancy and the runs' own changes leave, per channel and run [n], NaN where not valid."""
-        weights = self.transform()[:, columns_of(self.entries, chosen)]
-        pieces = self.dataset.recordings
+        weights, pieces = self.transform(), self.dataset.recordings
+        beta = -means.turned @ means.shared
+        beta[columns_of(self.entries, chosen)] += means.beta
+        library = weights @ beta
         out: dict[Channel, list[FloatArray]] = {c: [] for c in self.runs[0].channels}
         for run, place in zip(self.runs, pieces, strict=True):
             total = means.own[place].copy()
             total[self.shared] += means.shared
-            library = weights @ (means.beta - means.turned @ total[self.shared])
             for c, d in run.channels.items():
                 rest = d.residual - d.regressors @ library[d.index] - d.nuisances @ total[d.families]
                 out[c].append(np.where(d.valid, rest, np.nan))
@@ -369,7 +409,7 @@ class _Work:
         for step in range(_SETTLING if acting else 0):
             few = [self.entries[k] for k in sorted(chosen)]
             every = frozenset(range(len(few)))
-            fit = self.equations(noise, few).sets(variances, every).fit(every)
+            fit = self.equations(noise, few).sets(variances, every, resembling=False).fit(every)
             done = step + 1 == _SETTLING or (
                 len(mean) == len(fit.mean)
                 and bool(np.all(np.abs(fit.mean - mean) <= _SETTLED * np.sqrt(np.diag(fit.covariance))))
@@ -391,9 +431,8 @@ class _Work:
                 self.entries[k] = moved
                 again.add(k)
             present.append((e, scaled))
-        effects = present_effects(present)
-        for s in (s for run in (*self.dataset.signals, *self.dataset.disturbed) for s in run):
-            set_state(s, effects)
+        self.present = present_effects(present)
+        self.set_states()
         again |= {
             k
             for k, used in self._used.items()

@@ -68,22 +68,29 @@ _NONE: Final = 1e-12
 
 @dataclass(frozen=True)
 class Prediction:
-    """The set that predicts: entries, their scaled coefficients, and per channel and recording the sums of squares before
-    and after [Nm^2], each recording with the coefficients of all others, and the count of bins [r, 3].
+    """The set that predicts: entries, their scaled coefficients, its effects, and per channel and recording the sums of
+    squares before and after [Nm^2], each recording with the coefficients of all others, and the count of bins [r, 3].
     """
 
     chosen: Set
     mean: FloatArray
+    effects: list[Present]
     squares: dict[Channel, FloatArray]
 
 
 def predict(solution: Solution) -> Prediction:
-    """Return what predicts: between the set and the set with all values of the file what held-out runs want, without entries
-    whose size differs from run to run by more than itself: without these the error is less.
+    """Return what predicts: the set without entries whose size differs from run to run by more than itself, as a model that
+    is complete has it, at the states of its own simulation.
     """
-    grams, counts = _grams(solution)
-    without = fits_without(solution)
-    chosen = solution.chosen
+    chosen = steady(solution)
+    return predicted(solution.settled(chosen, without_discrepancy(solution)), chosen)
+
+
+def steady(solution: Solution) -> Set:
+    """Return the set without entries whose size differs from run to run by more than itself: without these the error is
+    less.
+    """
+    without, chosen = fits_without(solution), solution.chosen
     while chosen:
         sizes = Sizes(without, chosen)
         places = without[-1].places(chosen)
@@ -92,9 +99,14 @@ def predict(solution: Solution) -> Prediction:
         if not 1.0 < differs[worst] < math.inf:
             break
         chosen -= {worst}
-    slots = {solution.entries[k].slot for k in chosen}
-    values = {k for k, e in enumerate(solution.entries) if e.prior.file and e.slot not in slots}
-    wide = chosen | values
+    return chosen
+
+
+def predicted(solution: Solution, chosen: Set) -> Prediction:
+    """Return what predicts between a set and the set with all values of the file: what held-out runs want."""
+    grams, counts = _grams(solution)
+    without = fits_without(solution)
+    wide = chosen | (solution.equations.values - solution.equations.alike(chosen))
     part = stacked(grams, without, chosen, wide) if len(grams) > 1 else 0.0
     mixed = [sets.coefficients(chosen) + part * _added(sets, chosen, wide) for sets in without]
     contrasts = [np.append(-mean, 1.0) for mean in mixed[:-1]]
@@ -103,7 +115,8 @@ def predict(solution: Solution) -> Prediction:
         c: np.array([(g[c][-1, -1], float(x @ g[c] @ x), count[c]) for g, x, count in each]) for c in grams[0]
     }
     named = wide if part > 0.0 else chosen
-    return Prediction(named, mixed[-1][without[-1].columns(named)], squares)
+    mean = mixed[-1][without[-1].columns(named)]
+    return Prediction(named, mean, effects_of(without[-1], named, mean), squares)
 
 
 def stacked(
@@ -128,12 +141,16 @@ def _added(sets: Sets, chosen: Set, wide: Set) -> FloatArray:
     return Sets(sets.entries, left.T @ sets.gram @ left).coefficients(wide - chosen)
 
 
-def fits_without(solution: Solution) -> list[Sets]:
-    """Return the sets without each recording in turn, and with all (of one recording: with it); without discrepancy."""
-    plain = {
+def without_discrepancy(solution: Solution) -> dict[object, float]:
+    """Return the variances of a model that is complete."""
+    return {
         g: v if isinstance(g, tuple) and g[0] == "family" else _NONE for g, v in solution.variances.items()
     }
-    *without, everything = solution.equations.marginal(plain)
+
+
+def fits_without(solution: Solution) -> list[Sets]:
+    """Return the sets without each recording in turn, and with all (of one recording: with it); without discrepancy."""
+    *without, everything = solution.equations.marginal(without_discrepancy(solution))
     if len(without) == 1:
         without = [everything]
     return [Sets(solution.entries, gram) for gram in (*without, everything)]
@@ -256,21 +273,18 @@ class Judged:
 
 def present_of(solution: Solution) -> tuple[list[Present], FloatArray]:
     """Return the effects of the set, and what each recording has of its own without discrepancy [r, q]."""
-    mean = solution.sets.fit(solution.chosen).mean
     own = np.array([u[: len(solution.dataset.families)] for u in solution.own_means])
-    return effects_of(solution, solution.chosen, mean), own
+    return effects_of(solution.plain, solution.chosen, solution.plain.fit(solution.chosen).mean), own
 
 
-def effects_of(solution: Solution, chosen: Set, mean: FloatArray) -> list[Present]:
+def effects_of(sets: Sets, chosen: Set, mean: FloatArray) -> list[Present]:
     """Return the effects of a set with these coefficients."""
-    places = solution.sets.places(chosen)
-    return present_effects([(solution.entries[k], mean[at]) for k, at in places.items()])
+    return present_effects([(sets.entries[k], mean[at]) for k, at in sets.places(chosen).items()])
 
 
 def judged(solution: Solution) -> list[Judged]:
     """Return the effects of the set."""
-    sets, chosen = solution.sets, solution.chosen
-    plain = solution.equations.sets(solution.variances, chosen, resembling=False)
+    sets, plain, chosen = solution.sets, solution.plain, solution.chosen
     recorder = copy(solution.equations)
     recorder.recorded = recorded(
         solution.entries, max(s.step_s for run in solution.dataset.signals for s in run)
@@ -290,7 +304,7 @@ def judged(solution: Solution) -> list[Judged]:
         inner = solution.covariance[np.ix_(at, at)]
         z2, present = [], []
         for every in (s for s in alike if s.issuperset(members)):
-            there, mean = sets.places(every), sets.fit(every).mean
+            there, mean = plain.places(every), plain.fit(every).mean
             present += present_effects([(solution.entries[k], mean[there[k]]) for k in members])
             mean = np.concatenate([mean[there[k]] for k in members])
             z2.append(float(mean @ np.linalg.solve(inner, mean)))
@@ -352,7 +366,7 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
     limits_nm = {c: relevance * joints[c.joint].rated_torque_nm for c in dataset.runs[0].channels}
     left = remaining(dataset, *present_of(solution))
     rest = unexplained_residual(left)
-    predicting = effects_of(solution, prediction.chosen, prediction.mean)
+    predicting = prediction.effects
     left_nm2 = sum(rest.by_channel().values())
     total_nm2 = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + left_nm2
     left_share = left_nm2 / max(total_nm2, 1e-30)
@@ -423,7 +437,7 @@ def values_of(solution: Solution, j: Judged) -> dict[str, Value]:
     """Return the parameters of an effect with 95 % intervals, no narrower than what the equations simplify, that hold what
     rival sets make of it.
     """
-    fit = solution.sets.fit(solution.chosen)
+    fit = solution.plain.fit(solution.chosen)
     places = solution.sets.places(solution.chosen)
     half: dict[str, float] = dict.fromkeys(j.present.values, 0.0)
     none: dict[str, float] = {}
