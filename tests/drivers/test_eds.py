@@ -119,6 +119,10 @@ def test_a_tpdo_that_cannot_be_read_is_as_if_switched_off(tmp_path):
     assert [bool(each.fault) for each in found] == [False, False, True]
     assert not found[2].on
     assert "[1A02sub1]: ParameterValue=abc" in found[2].fault
+    without = re.sub(r"AccessType=\w+\n", "", section("1800sub2"))
+    one = survey_of_eds(written(tmp_path, (section("1800sub2"), without)), 5).tpdos[0]
+    assert "[1800sub2]: no AccessType" in one.fault
+    assert not one.type_fixed, "that is not known"
 
 
 NAMES = {

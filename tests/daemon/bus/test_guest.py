@@ -96,6 +96,15 @@ def test_an_odd_entry_of_a_dcf_is_a_note_where_nothing_depends_on_it(
         assert f"[{section}]: ParameterValue=abc" in note
 
 
+def test_a_name_that_cannot_be_read_is_a_note(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[3] / "drivers" / "eds" / "drive.eds").read_text()
+    before, name, after = text.partition("[1008]\n")
+    (tmp_path / "drive.eds").write_text(before + name + after.replace("DataType=0x0009\n", "", 1))
+    found = report(tmp_path, {"eds": "drive.eds"})
+    assert found["nodes"]["1"]["name"] == ""
+    assert ["[1008]: no DataType" in each for each in found["notes"]] == [True]
+
+
 @pytest.mark.parametrize(
     ("changes", "heard", "words"),
     [

@@ -144,6 +144,16 @@ def test_what_the_decoder_refuses_for_a_key_is_not_valid(tmp_path, file, path, v
     assert not valid(content, schema_of(file))
 
 
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [("joint_1.temperature", False), ("joint_1.objects", {"link_position": False}), ("sync", None)],
+)
+def test_what_a_file_may_leave_out_or_refuse_is_valid(path, value):
+    good = yaml.safe_load((ROOT / "models" / "bench.yaml").read_text())
+    content = {**good, path: None} if value is None else changed(good, path, value)
+    assert valid(content, schema_of("config"))
+
+
 @pytest.mark.parametrize("file", FILES)
 def test_the_command_prints_json(file, capsys):
     assert jtq.main(["schema", file]) == 0

@@ -280,6 +280,8 @@ def test_a_log_of_several_interfaces_comes_back_to_the_microsecond(tmp_path, cap
     assert [each.channel for each in McapCanReader(tmp_path / "b.mcap")] == [
         line.split()[1] for line in lines
     ]
+    stamps = read_topic(tmp_path / "b.mcap", f"/{names[0]}/frames")["stamps_ns"]
+    assert not (stamps % 1000).any(), "no more digits than the log has"
 
 
 def test_microseconds_are_rounded(tmp_path, capsys):

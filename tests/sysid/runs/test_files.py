@@ -653,6 +653,11 @@ def test_comments_and_words_for_a_blank_cell(tmp_path, text):
     assert column(run.table, "torque_nm").tolist() == [-2.0, -3.0, -4.0]
 
 
+def test_a_row_that_begins_with_a_blank_cell_is_no_comment(tmp_path):
+    [run] = read_runs([_file(tmp_path, GOOD + "#N/A,1.5,-5\n# the end\n")], segments=True)
+    assert run.notes[0] == "1 of 4 rows left out for a blank cell ('time_s' in 1)"
+
+
 def _interleaved(rows, values, first="t,q,i"):
     """A table of two topics; `values`: which of them each row has, in turn."""
     cells = {"q": "{0},", "i": ",{0}", "both": "{0},{0}", "": ","}
