@@ -6,7 +6,7 @@ from jtqd.estimator.observer cimport (
     Sample
 )
 from jtqd.estimator.fusion cimport (
-    AgreementLaw, AgreementState, Checkpoint, Fused, FusionLaw, Learned, OffsetLaw, OffsetState, ProofLaw, ProofState
+    AgreementLaw, AgreementState, Fused, FusionLaw, Learned, OffsetLaw, OffsetState, ProofLaw, ProofState
 )
 from jtqd.estimator.native_network cimport FusedTrustLaw, PathLaw, PathState, PerceptronLaw, TrustLaw
 from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw, UncertaintyLaw
@@ -89,7 +89,6 @@ cdef struct FusedState:
     PathState path
     InputState inputs
     ProofState proof
-    Checkpoint checkpoint
 
 cdef class FusedEstimator(Estimator):
     cdef FusedLaw law

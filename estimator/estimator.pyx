@@ -20,8 +20,8 @@ from jtqd.estimator.observer cimport (
     observe_fused, restart_guard
 )
 from jtqd.estimator.fusion cimport (
-    Checkpoint, Fused, Learned, Rest, TURN_WAVES, apart_nm2, at_rest, degrades, drop_block, early_factor, fading,
-    fill_agreement, fill_fusion, fill_offsets, fill_proof, follow_parting, fuse_paths, gather, implausible, keep_offsets, known_nm2,
+    Fused, Learned, Rest, TURN_WAVES, apart_nm2, at_rest, degrades, drop_block, early_factor, fading,
+    fill_agreement, fill_fusion, fill_offsets, fill_proof, fuse_paths, gather, go_back, implausible, keep_offsets, known_nm2,
     local_stiffness, mismatch_variance, offsets_of, pause_turn, possible_error, prove, report_offsets, restart_agreement,
     restart_offsets, restart_proof, restart_turn, reweigh, turn_differs, unproven_nm2, update_difference, update_turn
 )
@@ -356,7 +356,6 @@ cdef class FusedEstimator(Estimator):
         restart_link(&self.state.link)
         restart_inputs(&self.state.inputs)
         restart_proof(&self.law.proof, &self.state.proof)
-        memset(&self.state.checkpoint, 0, sizeof(Checkpoint))
 
     @property
     def zeros(self):
@@ -410,8 +409,8 @@ cdef class FusedEstimator(Estimator):
             check_inputs(&self.law.inputs, &self.state.inputs, x, self.state.guard.standing)
         if self.law.offsets.corrected:
             corrected = x[0]
-            corrected.link_position_rad -= self.state.offsets.link_rad
-            corrected.current_a -= self.state.offsets.current_a
+            corrected.link_position_rad -= self.state.offsets.now.link_rad
+            corrected.current_a -= self.state.offsets.now.current_a
             x = &corrected
         self.observed = observe_fused(
             &self.law.guard, &self.state.guard, &self.law.observer, &self.state.observer, x, &seen
@@ -511,10 +510,11 @@ cdef class FusedEstimator(Estimator):
             bound_inputs(&s.inputs, possible_error(&physics))
         unproven = prove(&law.proof, &s.proof, &physics, seen, x.dt_s, standing, in_order(&s.inputs))
         if law.offsets.estimated:
-            keep_offsets(&s.checkpoint, &s.offsets, in_order(&s.inputs), x.dt_s)
-            if out.status == VALID and fabs(seen.direction) > ONE_SIDED and in_order(&s.inputs):
-                follow_parting(
-                    &law.offsets, &s.checkpoint, &s.offsets, &s.agreement, &physics, fmin(fabs(raw), fabs(seen.torsion_nm)), x.dt_s
+            if not in_order(&s.inputs):
+                go_back(&s.offsets)
+            elif out.status == VALID and fabs(seen.direction) > ONE_SIDED:
+                keep_offsets(
+                    &law.offsets, &s.offsets, &s.agreement, &physics, fmin(fabs(raw), fabs(seen.torsion_nm)), x.dt_s
                 )
             self.update_path_difference(seen, x, &physics, loss.nm, out.status)
         if law.offsets.spread > 0.0:
@@ -567,7 +567,7 @@ cdef class FusedEstimator(Estimator):
             variance = self.half_interval(seen, &physics, loss.half, more, sqrt(variance)) ** 2
         if law.tracked and out.status != STANDSTILL:  # measured in motion; of the torsion, by its share
             variance += share * (law.tracking_noise + law.tracking_viscous * v * v / (1.0 + law.tracking_bend * v * v))
-        unproven = unproven_nm2(&law.proof, unproven, best.alpha, s.offsets.link_rad, seen.ahead_nm)
+        unproven = unproven_nm2(&law.proof, unproven, best.alpha, s.offsets.now.link_rad, seen.ahead_nm)
         out.sigma_nm = sqrt(variance + unproven + s.inputs.doubt * s.inputs.doubt)
         publish_within(out, law.limit)
 

@@ -72,27 +72,22 @@ cdef struct Block:  # sums over the samples of a block
     double dt, y, direction, velocity, torsion, variance
     int samples
 
-cdef struct OffsetState:
+cdef struct OffsetEstimate:
     double x[OFFSET_STATES]
     double p[OFFSET_STATES][OFFSET_STATES]
     double day_x[OFFSET_STATES]  # the same with the noise of the fit's days; estimated where their spread is known
     double day_p[OFFSET_STATES][OFFSET_STATES]
     double link_rad, current_a  # corrections of the readings
+
+cdef struct OffsetState:
+    OffsetEstimate now, kept  # kept: the paths have agreed by it
+    double agreed_s, parted_nm  # for how long the paths agree, below 0: by `kept` alone; least load of paths that were far apart
     double uncorrected_nm  # known link offset that is not corrected yet, as torque
-    float disagreeing_s, parted_nm  # for how long the paths differ by more than JUMP sigmas; least load [Nm] of paths that were apart, 0: not
+    double disagreeing_s  # for how long the paths differ by more than JUMP sigmas
     uint64_t jumps  # how often a known offset became unknown again
     Block block
 
-cdef struct Estimates:  # of the offsets
-    double x[OFFSET_STATES]
-    double day_x[OFFSET_STATES]
-    double link_rad, current_a
-
-cdef struct Checkpoint:
-    Estimates kept, recent  # the latter is younger, and not yet known to be of a healthy time
-    float calm_s, again_s  # without a fault; for how long paths that were apart agree by `kept`
-
-cdef void keep_offsets(Checkpoint *c, OffsetState *s, bint in_order, double dt) noexcept nogil
+cdef void go_back(OffsetState *s) noexcept nogil
 cdef int fill_offsets(OffsetLaw *law, double torque_per_ampere, double rated_nm, fused, bint used, bint estimated) except -1
 cdef void restart_offsets(const OffsetLaw *law, OffsetState *s) noexcept nogil
 cdef void drop_block(OffsetState *s) noexcept nogil
@@ -144,8 +139,8 @@ cdef struct AgreementState:
 
 cdef int fill_agreement(AgreementLaw *law, agreement, double rated_nm) except -1
 cdef void restart_agreement(AgreementState *s) noexcept nogil
-cdef void follow_parting(
-    const OffsetLaw *law, Checkpoint *c, OffsetState *s, AgreementState *a, const Fused *fused, double load, double dt
+cdef void keep_offsets(
+    const OffsetLaw *law, OffsetState *s, AgreementState *a, const Fused *fused, double load, double dt
 ) noexcept nogil
 cdef void update_difference(
     const OffsetLaw *offset_law, OffsetState *offsets, const AgreementLaw *law, AgreementState *s, double stiffness,

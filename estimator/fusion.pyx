@@ -62,9 +62,10 @@ variance of the torsion in the fusion is s_t^2 - k S_nm^2. The spread of the fus
 on the days of the fit (`correlation_s`). The first filter has noise that includes the day's friction, so that it learns more
 slowly; it judges what exceeds ordinary days, and the agreement of the paths.
 
-**Nothing is learned from a fault.** While an encoder is out of order, and a second longer, nothing is learned; with the begin of
-that the offsets go back to those of CALM_S before. Their covariance stays: an encoder that has slipped is learned again. A fault
-of current or velocity is seen as paths that are apart: what they agree by again is what was known before (`follow_parting`).
+**Nothing is learned from a fault.** The estimate of the offsets, states and covariance, is kept once the paths have agreed by it for
+CALM_S of motion. What was learned since goes back to it where that is contradicted: an encoder is out of order (then, and a second
+longer, nothing is learned); the paths agree by the kept estimate alone for AGAIN_S; or they disagree for JUMP_S: the link encoder has
+slipped, and its offset is unknown.
 
 **Agreement** of the paths over seconds: differences beyond those on the runs of the fit count as a mismatch of the joint file.
 A changed stiffness, hysteresis, encoder error or friction shows in the difference long before a single sample is implausible.
@@ -104,7 +105,7 @@ An error that both paths share (gear ratio of both encoders, external load) is n
 """
 
 from libc.math cimport INFINITY, exp, fabs, fmax, fmin, sqrt
-from libc.string cimport memcpy, memset
+from libc.string cimport memset
 
 from typing import Final, NamedTuple
 
@@ -346,7 +347,7 @@ cdef double SHRUNK_BELOW = 2.0, KEPT_ABOVE = 4.0, INVERSE_RANGE = 1.0 / (KEPT_AB
 # the file's sigma needs no correction
 cdef double COVERED = 0.5
 cdef double SLEW_S = 0.25, INVERSE_SLEW = 1.0 / SLEW_S
-cdef double CALM_S = 1.0, AGAIN_S = 0.5  # without a fault, until what was learned is of healthy inputs; of paths that agree again
+cdef double CALM_S = 1.0, AGAIN_S = 0.5  # of paths that agree by what was learned; that agree by what was kept alone
 cdef double LARGEST_LINK = 0.3  # prior standard deviation of the link offset as a torque, part of the rated torque
 cdef double CURRENT_SHARE = 0.2  # of the current offset as a torque, part of the current path's: the rest is friction
 cdef double LEAST_GAIN = 0.03  # least one of the gain
@@ -410,62 +411,44 @@ cdef void restart_offsets(const OffsetLaw *law, OffsetState *s) noexcept nogil:
     cdef int n
     memset(s, 0, sizeof(OffsetState))
     for n in range(OFFSET_STATES):
-        s.p[n][n] = s.day_p[n][n] = law.prior[n]
+        s.now.p[n][n] = s.now.day_p[n][n] = law.prior[n]
+    s.kept, s.parted_nm = s.now, INFINITY
 
 
-cdef Estimates _estimates(const OffsetState *s) noexcept nogil:
-    cdef Estimates e
-    memcpy(e.x, s.x, sizeof(e.x))
-    memcpy(e.day_x, s.day_x, sizeof(e.day_x))
-    e.link_rad, e.current_a = s.link_rad, s.current_a
-    return e
-
-
-cdef void _go_back(Checkpoint *c, OffsetState *s) noexcept nogil:
-    c.recent, c.calm_s = c.kept, 0.0
-    memcpy(s.x, c.kept.x, sizeof(s.x))
-    memcpy(s.day_x, c.kept.day_x, sizeof(s.day_x))
-    s.link_rad, s.current_a = c.kept.link_rad, c.kept.current_a
+cdef void go_back(OffsetState *s) noexcept nogil:
+    """Go back to the estimate that was kept."""
+    s.now = s.kept
+    s.agreed_s, s.parted_nm = 0.0, INFINITY
     drop_block(s)
 
 
-cdef void keep_offsets(Checkpoint *c, OffsetState *s, bint in_order, double dt) noexcept nogil:
-    """Keep offsets of a time that no fault has followed within CALM_S; with the begin of a fault go back to them."""
-    if in_order:
-        c.calm_s += dt
-        if c.calm_s > CALM_S and s.parted_nm == 0.0:
-            c.kept, c.recent = c.recent, _estimates(s)
-            c.calm_s = dt
-    elif c.calm_s > 0.0:
-        _go_back(c, s)
-
-
-cdef void follow_parting(
-    const OffsetLaw *law, Checkpoint *c, OffsetState *s, AgreementState *a, const Fused *fused, double load, double dt
+cdef void keep_offsets(
+    const OffsetLaw *law, OffsetState *s, AgreementState *a, const Fused *fused, double load, double dt
 ) noexcept nogil:
-    """Take a sample in motion: go back to the offsets of before the paths were apart, where these agree by them again.
+    """Take a sample in motion: keep the estimate that the paths agree by, go back to the kept one where they agree by it alone.
 
-    Under at least the smallest load [Nm] that they were apart with: there a joint that has changed does not agree. For AGAIN_S more
-    with what was learned since not in agreement, or a mismatch that the paths do not show, than without.
+    A mismatch that the paths do not show, under at least the smallest load [Nm] that they were far apart at, is not in agreement
+    either: a joint that has changed shows it there.
     """
-    cdef double change = law.stiffness * (c.kept.link_rad - s.link_rad), square = FOREIGN * FOREIGN * fused.variance
+    cdef double change = law.stiffness * (s.kept.link_rad - s.now.link_rad), apart = reach(fused, DISAGREE)
+    cdef double square = FOREIGN * FOREIGN * fused.variance
+    cdef bint by_kept
+    change += law.torque_per_ampere * (s.kept.current_a - s.now.current_a)
+    by_kept = fabs(fused.difference + change) <= apart
     if fused.difference * fused.difference > square:
-        s.parted_nm = fmax(load if s.parted_nm == 0.0 else fmin(s.parted_nm, load), 1e-6)
-    if s.parted_nm == 0.0:
-        return
-    change += law.torque_per_ampere * (c.kept.current_a - s.current_a)
-    if fabs(fused.difference + change) > reach(fused, DISAGREE):
-        c.again_s = 0.0
+        s.parted_nm = fmin(s.parted_nm, load)
+    if fabs(fused.difference) <= apart and (a.mismatch <= square or not by_kept):
+        s.agreed_s += dt
+    elif not by_kept:
+        s.agreed_s = 0.0
     elif load >= s.parted_nm:
-        c.again_s += dt if a.mismatch > square or fabs(fused.difference) > reach(fused, DISAGREE) else -dt
-    if fabs(c.again_s) < AGAIN_S:
-        return
-    if c.again_s > 0.0:
-        _go_back(c, s)
+        s.agreed_s = fmin(s.agreed_s, 0.0) - dt
+    if s.agreed_s > CALM_S:
+        s.kept, s.agreed_s, s.parted_nm = s.now, 0.0, INFINITY
+    elif s.agreed_s < -AGAIN_S:
+        go_back(s)
         a.trend = a.slow = a.fast = a.mismatch = a.gain_mismatch = a.turn.square = 0.0
         memset(a.turn.z, 0, sizeof(a.turn.z))  # X'X is of the motion, not of the difference
-    s.parted_nm, c.again_s, c.calm_s = 0.0, 0.0, 0.0
-    c.kept = c.recent = _estimates(s)
 
 
 cdef void drop_block(OffsetState *s) noexcept nogil:
@@ -507,7 +490,7 @@ cdef double local_stiffness(const FusedObserverLaw *law, double d) noexcept nogi
 
 cdef double _share(const OffsetLaw *law, const OffsetState *s) noexcept nogil:
     """Return the known part of the day's link offset, 0 to 1; 0 where the file has no spread over the days."""
-    return law.spread / (law.spread + s.day_p[0][0]) if law.spread > 0.0 else 0.0
+    return law.spread / (law.spread + s.now.day_p[0][0]) if law.spread > 0.0 else 0.0
 
 
 cdef double _shrunk(double x, double variance, double least) noexcept nogil:
@@ -520,8 +503,8 @@ cdef double _shrunk(double x, double variance, double least) noexcept nogil:
 
 cdef double _link_correction(const OffsetLaw *law, const OffsetState *s) noexcept nogil:
     """Return the correction of the link encoder [rad] before its slew."""
-    cdef double share = _share(law, s), used = _shrunk(s.x[0], s.p[0][0] + law.floor, share)
-    return used + share * s.day_x[0] if share > 0.0 else used
+    cdef double share = _share(law, s), used = _shrunk(s.now.x[0], s.now.p[0][0] + law.floor, share)
+    return used + share * s.now.day_x[0] if share > 0.0 else used
 
 
 cdef double _innovation(const double *h, const double *x, double measured) noexcept nogil:
@@ -566,36 +549,37 @@ cdef double _update_offsets(const OffsetLaw *law, OffsetState *s, double stiffne
     """
     cdef Block b = s.block
     cdef double h[OFFSET_STATES]
-    cdef double share = 1.0 / BLOCK, measured, innovation, way, remaining, before = s.disagreeing_s
+    cdef double share = 1.0 / BLOCK, measured, innovation, way, remaining
     cdef int n
     memset(&s.block, 0, sizeof(Block))
     h[0], h[1] = -stiffness, -law.torque_per_ampere * (1.0 - slope)
     h[2], h[3], h[4] = -b.direction * share, -b.velocity * share, b.torsion * share
     # the paths were corrected: the correction belongs to the measurement
-    measured = b.y * share + h[0] * s.link_rad + h[1] * s.current_a
+    measured = b.y * share + h[0] * s.now.link_rad + h[1] * s.now.current_a
     for n in range(OFFSET_STATES):
-        s.p[n][n] += law.drift[n] * b.dt
-        s.day_p[n][n] += law.drift[n] * b.dt
-    innovation = _innovation(h, s.x, measured)
+        s.now.p[n][n] += law.drift[n] * b.dt
+        s.now.day_p[n][n] += law.drift[n] * b.dt
+    innovation = _innovation(h, s.now.x, measured)
     s.disagreeing_s = s.disagreeing_s + b.dt if fabs(innovation) > JUMP * sqrt(b.variance * share) else 0.0
     if s.disagreeing_s > JUMP_S:
-        if before <= JUMP_S and s.p[0][0] < law.known:
-            s.jumps += 1
-        _forget_link(law, s.p)
-        _forget_link(law, s.day_p)
-    _update(h, s.x, s.p, innovation, b.variance * share * CORRELATION / b.dt)
+        s.jumps += s.now.p[0][0] < law.known
+        s.now = s.kept
+        _forget_link(law, s.now.p)
+        _forget_link(law, s.now.day_p)
+        s.disagreeing_s = 0.0
+    _update(h, s.now.x, s.now.p, _innovation(h, s.now.x, measured), b.variance * share * CORRELATION / b.dt)
     if law.spread > 0.0:
-        _update(h, s.day_x, s.day_p, _innovation(h, s.day_x, measured), b.variance * share * law.correlation / b.dt)
+        _update(h, s.now.day_x, s.now.day_p, _innovation(h, s.now.day_x, measured), b.variance * share * law.correlation / b.dt)
     if not law.corrected:
         return innovation
     way = b.dt * INVERSE_SLEW
     if way > 1.0:
         way = 1.0
-    s.link_rad += way * (_link_correction(law, s) - s.link_rad)
-    s.current_a += way * (_shrunk(s.x[1], s.p[1][1], 0.0) - s.current_a)
+    s.now.link_rad += way * (_link_correction(law, s) - s.now.link_rad)
+    s.now.current_a += way * (_shrunk(s.now.x[1], s.now.p[1][1], 0.0) - s.now.current_a)
     # without the uncertainty of the offset: on average 0 for a joint without one
-    remaining = s.x[0] - s.link_rad
-    s.uncorrected_nm = law.stiffness * sqrt(fmax(0.0, remaining * remaining - s.p[0][0] - law.floor))
+    remaining = s.now.x[0] - s.now.link_rad
+    s.uncorrected_nm = law.stiffness * sqrt(fmax(0.0, remaining * remaining - s.now.p[0][0] - law.floor))
     return innovation
 
 
@@ -604,7 +588,7 @@ cdef double known_nm2(const OffsetLaw *law, const OffsetState *s) noexcept nogil
     cdef double share = _share(law, s), late
     if not share > 0.0:
         return 0.0
-    late = law.stiffness * (_link_correction(law, s) - s.link_rad)
+    late = law.stiffness * (_link_correction(law, s) - s.now.link_rad)
     return fmax(0.0, share * law.spread_nm - late * late)
 
 
@@ -614,12 +598,12 @@ cdef double early_factor(const OffsetLaw *law, double known) noexcept nogil:
 
 
 cdef double _uncorrected_torque(const OffsetLaw *law, const OffsetState *s) noexcept nogil:
-    return law.stiffness * (s.x[0] - s.link_rad)
+    return law.stiffness * (s.now.x[0] - s.now.link_rad)
 
 
 cdef bint implausible(const OffsetLaw *law, const OffsetState *s) noexcept nogil:
     """Return whether the link offset is significantly beyond the file's limit for a healthy joint."""
-    return fabs(s.x[0]) > law.limit and fabs(s.x[0]) > KEPT_ABOVE * sqrt(s.p[0][0])
+    return fabs(s.now.x[0]) > law.limit and fabs(s.now.x[0]) > KEPT_ABOVE * sqrt(s.now.p[0][0])
 
 
 cdef void report_offsets(const OffsetLaw *law, const OffsetState *s, Learned *out) noexcept nogil:
@@ -627,10 +611,10 @@ cdef void report_offsets(const OffsetLaw *law, const OffsetState *s, Learned *ou
     memset(out, 0, sizeof(Learned))
     if not law.corrected:
         return
-    out.link_rad, out.link_sigma_rad, out.link_used_rad = s.x[0], sqrt(s.p[0][0]), s.link_rad
-    out.current_a, out.current_sigma_a, out.current_used_a = s.x[1], sqrt(s.p[1][1]), s.current_a
+    out.link_rad, out.link_sigma_rad, out.link_used_rad = s.now.x[0], sqrt(s.now.p[0][0]), s.now.link_rad
+    out.current_a, out.current_sigma_a, out.current_used_a = s.now.x[1], sqrt(s.now.p[1][1]), s.now.current_a
     out.limit_rad, out.jumps, out.flags = law.limit, s.jumps, IS_TRACKED
-    if s.p[0][0] < law.known:
+    if s.now.p[0][0] < law.known:
         out.flags |= IS_LEARNED
     if implausible(law, s):
         out.flags |= IS_BEYOND
@@ -709,7 +693,7 @@ cdef double _level(double level, double square, double dt) noexcept nogil:
 
 cdef double _excess(const OffsetState *offsets, double sigmas) noexcept nogil:
     """Return the magnitude of the gain less so many of its standard deviations, at least 0."""
-    return fmax(0.0, fabs(offsets.x[4]) - sigmas * sqrt(offsets.p[4][4]))
+    return fmax(0.0, fabs(offsets.now.x[4]) - sigmas * sqrt(offsets.now.p[4][4]))
 
 
 cdef double _gain_mismatch(const AgreementLaw *law, const OffsetState *offsets, double sigmas) noexcept nogil:
@@ -926,8 +910,8 @@ def levels(fused, double rated_nm, dt_s, difference_nm, direction, velocity_rad_
         if gather(&offsets, x[k, 0], x[k, 1], x[k, 2], x[k, 3], x[k, 4], x[k, 5] - law.spread_nm):
             dt, torsion = offsets.block.dt, offsets.block.torsion / offsets.block.samples
             # these readings are not corrected, as `_update_offsets` expects them
-            offsets.block.y += law.stiffness * offsets.link_rad * offsets.block.samples
-            offsets.block.y += (1.0 - x[k, 6]) * offsets.current_a * offsets.block.samples
+            offsets.block.y += law.stiffness * offsets.now.link_rad * offsets.block.samples
+            offsets.block.y += (1.0 - x[k, 6]) * offsets.now.current_a * offsets.block.samples
             innovation = _update_offsets(&law, &offsets, law.stiffness, x[k, 6])
             remaining = _uncorrected_torque(&law, &offsets)
             _update_agreement(&levels_law, &s, &offsets, remaining, innovation, dt)
@@ -976,8 +960,8 @@ def track_run(
     restart_agreement(&agreement)
     restart_proof(&proof_law, &proof)
     for k in range(x.shape[0]):
-        to[1, k], to[2, k] = x[k, 9] * s.link_rad, -(1.0 - x[k, 8]) * s.current_a
-        raw, torsion, difference = x[k, 1] - s.current_a, x[k, 4] + to[1, k], x[k, 6] + to[1, k] - to[2, k]
+        to[1, k], to[2, k] = x[k, 9] * s.now.link_rad, -(1.0 - x[k, 8]) * s.now.current_a
+        raw, torsion, difference = x[k, 1] - s.now.current_a, x[k, 4] + to[1, k], x[k, 6] + to[1, k] - to[2, k]
         physics = fuse_paths(&paths, raw, raw - torsion + difference, x[k, 2], x[k, 3], torsion, x[k, 5])
         seen.raw_nm, seen.torsion_nm, seen.direction, seen.ahead_nm = raw, torsion, x[k, 7], x[k, 10]
         unproven = prove(&proof_law, &proof, &physics, &seen, x[k, 0], rests[k], True)
@@ -990,7 +974,7 @@ def track_run(
             reweigh(&physics, known)
         to[0, k], to[3, k], to[5, k] = physics.alpha, physics.sigma * early_factor(&law, known), known
         to[4, k] = apart_nm2(&physics, 0.0 if levels_law.used else s.uncorrected_nm)
-        to[4, k] += unproven_nm2(&proof_law, unproven, physics.alpha, s.link_rad, x[k, 10])
+        to[4, k] += unproven_nm2(&proof_law, unproven, physics.alpha, s.now.link_rad, x[k, 10])
         if levels_law.used:
             to[4, k] += mismatch_variance(&agreement, physics.alpha, torsion)
     return tuple(out)
