@@ -27,12 +27,14 @@ test: style ## everything but the tests marked campaign
 	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part.
 	$(BIN)/python -m compileall -q daemon drivers estimator models sim_can sysid tests tools validation
 	@status=0; \
-	$(MAKE) --no-print-directory -k -j5 --output-sync=target test-guest test-sysid test-hidden test-here types || status=$$?; \
-	$(MAKE) --no-print-directory -k test-native || status=$$?; \
+	$(MAKE) --no-print-directory -k -j4 --output-sync=target test-guest test-hidden test-here types || status=$$?; \
+	$(MAKE) --no-print-directory -k -j2 --output-sync=target test-native test-sysid || status=$$?; \
 	exit $$status
 
 # All lanes that keep no time of this machine at once; the bench kernel keeps a time of its own, so it feels none of them.
 BEHIND := nice -n 10
+# What only takes turns that nobody else wants: processes at the pace of the clock sleep for most of the time.
+LEFT_OVER := chrt --idle 0
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 # What takes the processor for about as long as the rest of sysid, and as all else.
 HIDDEN := tests/validation tests/examples tests/sysid/batch tests/sysid/evaluate tests/sysid/fit tests/sysid/train
@@ -45,7 +47,7 @@ test-here:
 	$(ONE_THREAD) $(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN:%=--ignore=%) --ignore=tests/sysid
 
 test-sysid:
-	$(ONE_THREAD) $(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN:%=--ignore=%) tests/sysid
+	$(ONE_THREAD) $(LEFT_OVER) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN:%=--ignore=%) tests/sysid
 
 test-hidden:
 	$(ONE_THREAD) $(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN)
@@ -55,7 +57,7 @@ test-guest: kernel-with-vcan
 	nice -n 5 $(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign" $(call MARKED,socketcan|boots)
 
 # Processes at the pace of this machine's clock, whose inputs come in time, or that are judged by how quick or how often
-# something is: nothing beside them.
+# something is: beside them runs only what takes turns that are left over.
 test-native:
 	$(BIN)/python -m pytest $(SLOWEST) -m "native and not (campaign or socketcan or boots)" $(call MARKED,native)
 
