@@ -100,12 +100,12 @@ def _within(inner: FloatArray, right: FloatArray, low: FloatArray, high: FloatAr
 
 
 class Means(NamedTuple):
-    """Of coefficients [q], shared discrepancy [k], each recording's own [r][N]; turned: of all coefficients in it [E, k]."""
+    """Of coefficients [q], shared discrepancy [k], each recording's own [r][N]; overlap of features and columns [E, k]."""
 
     beta: FloatArray
     shared: FloatArray
     own: list[FloatArray]
-    turned: FloatArray
+    overlap: FloatArray
 
 
 class Scatter(NamedTuple):
@@ -363,15 +363,15 @@ class Equations:
         many = {g: [self.E + k for k in self.shared.tolist() if self.groups[k] == g] for g in self.most}
         return {g: np.sum((total[f, : self.E] / energy) ** 2, axis=0) for g, f in many.items()}
 
-    def _turned(self, total: FloatArray, chosen: Set) -> tuple[FloatArray, FloatArray]:
+    def _orthogonal(self, total: FloatArray, chosen: Set) -> tuple[FloatArray, FloatArray]:
         """Return the equations over [E, shared, response] with a discrepancy that has no part along the columns of a set and
-        of the values of the file (Plumlee 2017, J. Am. Stat. Assoc. 112): what these explain is none; and the turn.
+        of the values of the file (Plumlee 2017, J. Am. Stat. Assoc. 112): what these explain is none; and that basis.
         """
         at, e = columns_of(self.entries, chosen | self.values - self.alike(chosen)), self.E
-        turn = np.eye(len(total))
+        basis = np.eye(len(total))
         inner = total[np.ix_(at, at)] + np.eye(len(at))
-        turn[at, e : e + len(self.shared)] = -np.linalg.solve(inner, total[at, e : e + len(self.shared)])
-        return turn.T @ total @ turn, turn
+        basis[at, e : e + len(self.shared)] = -np.linalg.solve(inner, total[at, e : e + len(self.shared)])
+        return basis.T @ total @ basis, basis
 
     def first(self) -> dict[object, float]:
         """Return the variances to begin with."""
@@ -382,8 +382,11 @@ class Equations:
         """Return the sets at these variances, with the discrepancy beside a set; resembling: and what resembles any."""
 
         parts, _, keep = self._reduced(variances)
-        total, turn = self._turned(np.sum(parts, axis=0), chosen)
-        gram, scatter = self._without_shared(total, variances)[0], self._scatter(total, turn, keep, variances)
+        total, basis = self._orthogonal(np.sum(parts, axis=0), chosen)
+        gram, scatter = (
+            self._without_shared(total, variances)[0],
+            self._scatter(total, basis, keep, variances),
+        )
         gram = self._without_resemblance(gram, variances) if resembling else gram
         return Sets(self.entries, gram, scatter)
 
@@ -443,7 +446,7 @@ class Equations:
     def _scatter(
         self,
         total: FloatArray,
-        turn: FloatArray,
+        basis: FloatArray,
         keep: Sequence[tuple[FloatArray, FloatArray]],
         variances: Variances,
     ) -> Scatter:
@@ -457,7 +460,7 @@ class Equations:
 
         whole = np.zeros_like(total)
         for noise, (lower, cross) in zip(self.noise, keep, strict=True):
-            whole += turn.T @ left(noise, self._outer, self._inner, cho_solve((lower, True), cross)) @ turn
+            whole += basis.T @ left(noise, self._outer, self._inner, cho_solve((lower, True), cross)) @ basis
         w, o = self._places()
         inner = total[np.ix_(w, w)] + np.diag(1.0 / self._shared_variances(variances))
         into = np.asarray(np.linalg.solve(inner, total[np.ix_(w, o)]), np.float64)
@@ -478,7 +481,7 @@ class Equations:
         low, high = (np.append(x[at], np.full(many, none)) for x, none in ends)
         for step in range(steps + 1):
             parts, logs, keep = self._reduced(now)
-            total, turn = self._turned(np.sum(parts, axis=0), chosen)
+            total, basis = self._orthogonal(np.sum(parts, axis=0), chosen)
             q = np.concatenate((at, np.arange(e, e + many))).astype(np.intp)
             w = self._shared_variances(now)
             inner = total[np.ix_(q, q)] + np.diag(np.concatenate((np.ones(len(at)), 1.0 / w)))
@@ -490,13 +493,13 @@ class Equations:
             score -= 2.0 * sum(self.entries[k].odds for k in chosen)
             mine = np.zeros(e + many + 1)
             mine[q], mine[-1] = -theta, 1.0
-            contrast = turn @ mine
+            contrast = basis @ mine
             squares, spread, means = np.zeros(self.N), np.zeros(self.N), []
             for factor, cross in keep:
                 inverse = np.linalg.inv(factor)
                 inverse = inverse.T @ inverse
                 u = inverse @ (cross @ contrast)
-                b = inverse @ cross @ turn[:, q]
+                b = inverse @ cross @ basis[:, q]
                 squares += u**2
                 spread += np.diag(inverse) + np.sum(b @ covariance * b, axis=1)
                 means.append(u)
@@ -507,10 +510,10 @@ class Equations:
                     shared = now["shared", g]
                     score += n0 * (math.log(shared) + v0 / shared)
             if step == steps:
-                score += self._scatter(total, turn, keep, now).by_chance(-mine[:e])
+                score += self._scatter(total, basis, keep, now).by_chance(-mine[:e])
                 break
             now = self._maximised(now, (squares, spread), (theta[len(at) :], np.diag(covariance)[len(at) :]))
-        return now, score, Means(theta[: len(at)], theta[len(at) :], means, -turn[:e, e : e + many])
+        return now, score, Means(theta[: len(at)], theta[len(at) :], means, -basis[:e, e : e + many])
 
     def _maximised(
         self, now: Variances, own: tuple[FloatArray, FloatArray], shared: tuple[FloatArray, FloatArray]

@@ -98,14 +98,9 @@ class Solution:
         work = self.work.copy()
         work.settle(chosen, self.equations.sets(variances).fit(chosen).mean, self.noise, variances)
         self.work.set_states()
-        equations = work.equations(self.noise)
+        made = work.equations(self.noise)
         return replace(
-            self,
-            entries=work.entries,
-            equations=equations,
-            runs=work.runs,
-            disturbed=work.disturbed,
-            work=work,
+            self, equations=made, work=work, entries=work.entries, runs=work.runs, disturbed=work.disturbed
         )
 
     def transform(self) -> FloatArray:
@@ -380,7 +375,7 @@ class _Work:
     def left(self, chosen: Set, means: Means) -> dict[Channel, list[FloatArray]]:
         """Return what set, discrepancy and the runs' own changes leave, per channel and run [n], NaN where not valid."""
         weights, pieces = self.transform(), self.dataset.recordings
-        beta = -means.turned @ means.shared
+        beta = -means.overlap @ means.shared
         beta[columns_of(self.entries, chosen)] += means.beta
         library = weights @ beta
         out: dict[Channel, list[FloatArray]] = {c: [] for c in self.runs[0].channels}

@@ -510,6 +510,22 @@ def test_noise_that_a_column_brings_into_the_discrepancy_is_taken_out_there_as_w
     assert scores[1] > scores[0] - 6.0, "the response has no such effect"
 
 
+def test_noise_that_the_set_takes_out_of_a_feature_is_not_left_in_its_response() -> None:
+    """A feature is an entry's column and a clean one. Beside the entry only the clean one is discrepancy, and its share of
+    the response brings no noise; beside the empty set it brings that of the whole feature.
+    """
+    rng = np.random.default_rng(9)
+    x, clean = rng.normal(size=(2, 400))
+    block = np.column_stack((x, x + clean, x + 2.0 * clean))
+    noise = np.zeros((3, 3))
+    noise[:2, :2] = 20.0  # of x, in the column and in the feature
+    equations = equations_of([block, block], [entry()], ("discrepancy",), shared=(0,), noise=noise)
+    variances = {"discrepancy": 1e-9, ("shared", "discrepancy"): 10.0}
+    left = [equations.sets(variances, s).noise.gram[-1, -1] for s in (frozenset[int](), frozenset({0}))]
+    assert left[0] > 40.0
+    assert abs(left[1]) < 0.05 * left[0]
+
+
 def test_an_entry_that_a_discrepancy_nearly_follows_is_found_among_weak_ones() -> None:
     """Of the empty set the discrepancy is as large as the effect: beside it weak columns, which cost nothing, promise more.
     Without a discrepancy the entry is in the first set that is tried.
