@@ -24,16 +24,14 @@ hidden-effect: $(VENV)/.installed-analysis ## hide an effect in the emulated ben
 	$(BIN)/python -m examples.hidden_effect --effect torque_constant --bus none --out hidden --picture hidden/before_after.png
 
 test: style ## everything but the tests marked campaign
-	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part.
-	$(BIN)/python -m compileall -q daemon drivers estimator models sim_can sysid tests tools validation
-	@status=0; \
-	$(MAKE) --no-print-directory -k -j4 --output-sync=target test-guest test-hidden test-here types || status=$$?; \
-	$(MAKE) --no-print-directory -k -j2 --output-sync=target test-native test-sysid || status=$$?; \
-	exit $$status
+	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part. pytest compiles its test_*.py.
+	$(BIN)/python -m compileall -q -j 0 -x '/test_[^/]*$$' daemon drivers estimator models sim_can sysid tests tools validation
+	@$(MAKE) --no-print-directory -k -j3 --output-sync=target test-native test-guest test-hidden test-sysid test-here types
 
-# All lanes that keep no time of this machine at once; the bench kernel keeps a time of its own, so it feels none of them.
+# Three lanes at once, in this order. The native one sleeps for most of its time, and beside it run those that only take the
+# turns that nobody else wants; the bench kernel keeps a time of its own. What starts processes that are waited for comes when
+# it has ended.
 BEHIND := nice -n 10
-# What only takes turns that nobody else wants: processes at the pace of the clock sleep for most of the time.
 LEFT_OVER := $(if $(shell chrt --idle 0 echo yes 2>/dev/null),chrt --idle 0,nice -n 19)
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 # What takes the processor for about as long as the rest of sysid, and as all else.
@@ -50,11 +48,12 @@ test-sysid:
 	$(ONE_THREAD) $(LEFT_OVER) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN:%=--ignore=%) tests/sysid
 
 test-hidden:
-	$(ONE_THREAD) $(BEHIND) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN)
+	$(ONE_THREAD) $(LEFT_OVER) $(BIN)/python -m pytest $(SLOWEST) -m "$(HERE)" $(HIDDEN)
 
-# The longest lane: a turn of the processor that it misses is time at the end with one core at work.
-test-guest: kernel-with-vcan
-	nice -n 5 $(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign" $(call MARKED,socketcan|boots)
+# It builds its kernel itself: a lane that waits for another target would lose its turn to the next one.
+test-guest: $(VENV)/.installed-test
+	$(LEFT_OVER) $(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
+	$(LEFT_OVER) $(BIN)/python -m pytest $(SLOWEST) -m "(socketcan or boots) and not campaign" $(call MARKED,socketcan|boots)
 
 # Processes at the pace of this machine's clock, whose inputs come in time, or that are judged by how quick or how often
 # something is: beside them runs only what takes turns that are left over.
@@ -100,7 +99,7 @@ soak-exact: $(VENV)/.installed-dev ## the same in the bench kernel: as much gues
 	$(BIN)/python -m tests.slow.soak --exact --minutes 1440 --wall 3600
 
 kernel-with-vcan: $(VENV)/.installed-test
-	$(BEHIND) $(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
+	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
 
 bench-kernel: $(VENV)/.installed ## build the kernel with SocketCAN into the cache, once
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build
