@@ -210,13 +210,13 @@ def test_beside_a_master_of_the_library(robots: Callable[..., Robot]) -> None:
     robot.until(lambda: robot.statuses()[-200:] == [3] * 200)  # nobody has checked the identity
     robot.order("identify")
     robot.until(lambda: robot.statuses()[-200:] == [2] * 200)
-    heard = robot.hear(2.0)
+    heard = robot.hear(1.0)
     ids = [can_id for _, can_id, _ in heard]
     assert abs(ids.count(0x080) - ids.count(0x1A0)) <= 2
     assert set(ids) <= {0x080, 0x181, 0x281, 0x182, 0x282, 0x183, 0x381, 0x382, 0x701, 0x702, 0x703, *OWN}
-    assert 19 <= ids.count(0x720) <= 21
+    assert 9 <= ids.count(0x720) <= 11
     syncs = [at for at, can_id, _ in heard if can_id == 0x080]
-    assert len(syncs) == pytest.approx(2000, abs=3)
+    assert len(syncs) == pytest.approx(1000, abs=3)
     assert robot.answers() == 1
     for order, words, code in (
         ("remap", "node 1: its configuration was changed (1", 0xFF03),
@@ -248,12 +248,13 @@ def test_beside_a_master_of_the_library(robots: Callable[..., Robot]) -> None:
 
 
 def test_a_listener_sends_nothing(robots: Callable[..., Robot]) -> None:
-    robot = robots("--listener", "--duration", "6", dcf=False)
+    robot = robots("--listener", "--duration", "2", dcf=False)
     robot.order("boot")
-    heard = robot.hear(6.0)
+    heard = robot.hear(1.5)
     assert {can_id for _, can_id, _ in heard}.isdisjoint(OWN)
     assert robot.answers() == 0
-    heard = robot.hear(2.0)
+    assert robot.jtqd.poll() is None
+    heard = robot.hear(1.0)
     assert {can_id for _, can_id, _ in heard}.isdisjoint(OWN)
     assert robot.jtqd.wait(20) == 0
     assert robot.jtqd.stdout is not None
