@@ -1,5 +1,6 @@
 """`jtq status`, `check` and `doctor` on real SocketCAN, beside a running daemon and without one."""
 
+import io
 import json
 import os
 import signal
@@ -8,12 +9,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from jtqd.daemon.jtq import main
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.frame_socket import open_frame_socket
 
@@ -70,17 +72,14 @@ def cycles(runtime: Path) -> int:
 
 def jtq(*arguments: str, runtime: Path) -> tuple[int, dict[str, Any], str]:
     """Exit status, JSON (empty where there is none) and standard error of one command."""
-    done = subprocess.run(
-        [sys.executable, "-m", "jtqd.daemon.jtq", *arguments],
-        env={**os.environ, "RUNTIME_DIRECTORY": str(runtime), "COLUMNS": "120"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert "Traceback" not in done.stderr, done.stderr
-    content = json.loads(done.stdout) if done.stdout.startswith("{") else {}
-    return done.returncode, content, done.stderr + ("" if content else done.stdout)
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.setenv("RUNTIME_DIRECTORY", str(runtime))
+        patch.setenv("COLUMNS", "120")
+        status = main(list(arguments))
+    printed, reported = out.getvalue(), err.getvalue()
+    content = json.loads(printed) if printed.startswith("{") else {}
+    return status, content, reported + ("" if content else printed)
 
 
 def levels(content: dict[str, Any]) -> dict[str, str]:
