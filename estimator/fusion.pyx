@@ -79,10 +79,10 @@ them count the gain state g and the offset of the link encoder that is not corre
 each (index 0) that held-out runs of the fit did not exceed:
 
     mismatch^2 = level^2 ([slow - slow_0]+ + [fast - fast_0]+) + zero^2 [offset^2 - offset_0^2]+
-                 + (gain [|g| - n sigma_g - g_0]+ tau)^2
+                 + (gain [|g| - n sigma_g - g_0]+ tau)^2 + waves^2
     sigma^2 = (as fused)^2 + (max(alpha, 1 - alpha) mismatch)^2
 
-Level, gain, zero: `level_factor`, `gain_factor`, `zero_factor`, above 1, because states and priors absorb a part of an error.
+Waves: below. Level, gain, zero: `level_factor`, `gain_factor`, `zero_factor`, above 1, because states and priors absorb a part of an error.
 N: `gain_sigmas`, because a joint that is always driven cannot separate friction from a gain. Which path is wrong is not known:
 the larger weight counts.
 
@@ -99,7 +99,10 @@ The remainder r = tau_t - tau_c - sum_k w_k (c_k + ...) has waves a by least squ
 
     a = (sum w w' + LEAST_S 1)^-1 sum w r,        square = a' C^-1 a
 
-C: covariance of a over the runs of the fit. Above the file's `limit` the status is degraded; sigma is unchanged.
+C: covariance of a over the runs of the fit, so that square is 6 on average. Above the file's `limit` the status is degraded.
+Sigma is widened by the waves as far as they are not those of ordinary days (James and Stein 1961, positive part):
+
+    waves^2 = a'a/2 [1 - 6/square]+
 
 An error that both paths share (gear ratio of both encoders, external load) is not in the difference.
 """
@@ -700,6 +703,15 @@ cdef double _gain_mismatch(const AgreementLaw *law, const OffsetState *offsets, 
     return law.gain_factor * fmax(0.0, _excess(offsets, sigmas) - law.gain)
 
 
+cdef double _waves_beyond(const TurnState *t) noexcept nogil:
+    """Return the mean square [Nm^2] of the waves, shrunk by what is usual (positive part, James and Stein 1961)."""
+    cdef double sum = 0.0
+    cdef int k
+    for k in range(TURN_WAVES):
+        sum += t.a[k] * t.a[k]
+    return 0.5 * sum * (1.0 - TURN_WAVES / t.square)
+
+
 cdef void _update_agreement(
     const AgreementLaw *law, AgreementState *s, const OffsetState *offsets, double uncorrected_nm, double innovation, double dt
 ) noexcept nogil:
@@ -711,6 +723,8 @@ cdef void _update_agreement(
     s.fast = _level(s.fast, rest * rest, dt)
     s.mismatch = law.level_square * (fmax(0.0, s.slow - law.slow) + fmax(0.0, s.fast - law.fast))
     s.mismatch += law.zero_square * fmax(0.0, uncorrected_nm * uncorrected_nm - law.zero)
+    if s.turn.square > TURN_WAVES:
+        s.mismatch += _waves_beyond(&s.turn)
     s.gain_mismatch = _gain_mismatch(law, offsets, law.gain_sigmas)
 
 

@@ -33,7 +33,7 @@ beyond is doubt that grows from zero, so a run slightly beyond costs little (est
 
 Waves of the difference over the motor's turn, in contrast, are the same on every day. Least squares finds what all runs have
 in common, with the slow part of each second removed on both sides. The residual waves of a run count by their covariance
-over all runs, and the limit is beyond the largest of any run.
+over all runs, and the limit is beyond that of ordinary blocks, not of the worst one, which a changed gear would hide behind.
 """
 
 from __future__ import annotations
@@ -333,9 +333,11 @@ def fit_agreement(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) 
     def level(values: FloatArray) -> float:
         return float(np.quantile(values, QUANTILE))
 
+    turn = fit_turn(moving)
     found = Agreement(
         slow_nm=max(level(np.sqrt(slow)), _FLOOR_NM),
-        fast_nm=max(level(np.sqrt(fast)), _FLOOR_NM),
+        # errors over the motor's turn show in its waves
+        fast_nm=max(float(np.quantile(np.sqrt(fast), QUANTILE if turn is None else LOWERED)), _FLOOR_NM),
         gain=level(gain),
         zero_nm=level(offset),
         level_factor=LEVEL_FACTOR,
@@ -345,13 +347,13 @@ def fit_agreement(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) 
     )
     doubt = np.concatenate([run[-1] for run in levels_of(found)])
     found = replace(found, lowered_nm=max(float(np.quantile(doubt, LOWERED)), _FLOOR_NM))
-    return replace(found, turn=fit_turn(moving))
+    return replace(found, turn=turn)
 
 
 # Waves of the turn -----------------------------------------------------------------------------------
 
-TURN_BEYOND: Final = 1.1
-"""The limit in parts of the largest square of any run. Chosen on runs that no figure is reported on."""
+TURN_BEYOND: Final = 2.0
+"""The limit in parts of what LOWERED of the blocks of all runs have. Chosen on runs that no figure is reported on."""
 _FEWEST_RUNS: Final = 16
 """With motion, for a covariance of the six waves."""
 _TURN_FLOOR_NM: Final = 1e-2
@@ -369,8 +371,8 @@ def fit_turn(runs: Sequence[PathResiduals]) -> Turn | None:
     residual = np.concatenate(each)
     covariance = residual.T @ residual / len(residual) + _TURN_FLOOR_NM**2 * np.eye(TURN_WAVES)
     found = replace(found, covariance_nm2=_lower(covariance))
-    largest = max(float(_turn_waves(found, run)[1].max(initial=0.0)) for run in runs)
-    return replace(found, limit=TURN_BEYOND * largest)
+    squares = np.concatenate([_turn_waves(found, run)[1] for run in runs])
+    return replace(found, limit=TURN_BEYOND * float(np.quantile(squares, LOWERED)))
 
 
 def _turn_waves(turn: Turn, run: PathResiduals) -> tuple[FloatArray, FloatArray]:

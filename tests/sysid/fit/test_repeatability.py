@@ -173,6 +173,18 @@ def test_waves_of_the_turn_are_those_that_runs_have_in_common() -> None:
     assert square(other)[1000 // 64] > found.limit, "the first second"
 
 
+def test_one_odd_run_does_not_set_the_limit() -> None:
+    """A changed gear would hide behind it."""
+    runs = [turning(seed) for seed in range(200)]
+    found, odd = (
+        fit_turn(runs),
+        fit_turn([*runs, turning(500, PARTS + np.array([[0.6], [0.0], [0.0], [0.0]]))]),
+    )
+    assert found is not None
+    assert odd is not None
+    assert odd.limit < 1.3 * found.limit
+
+
 @pytest.mark.parametrize("runs", [[turning(seed) for seed in range(15)], [], [turning(9, speed=0.0)] * 20])
 def test_too_few_runs_in_motion_have_no_waves(runs: list[PathResiduals]) -> None:
     assert fit_turn(runs) is None
