@@ -54,6 +54,7 @@ cdef struct InputLaw:
     double tolerance  # [Nm]: below it nothing is doubtful
     double load_rate  # [Nm/s] of the fastest load
     double most  # [Nm]
+    double noise  # variance of both readings that the file's sigma has [Nm^2]
 
 cdef struct Runs:  # of equal samples at rest: length of the last one, mean length, how many have been seen
     double usual
@@ -73,12 +74,14 @@ cdef struct InputState:
     double strange  # samples out of order lately
     double still_nm  # current [Nm] when the link's reading began to stand still
     Runs runs, link_runs  # of samples that are equal as a whole, and of equal readings of the link
+    double noise  # variance of the twist's second differences
     bint going
 
-cdef int fill_inputs(InputLaw *law, joint, torsion) except -1
-cdef void restart_inputs(InputState *s) noexcept nogil
+cdef int fill_inputs(InputLaw *law, joint, torsion, double noise) except -1
+cdef void restart_inputs(const InputLaw *law, InputState *s) noexcept nogil
 cdef void drop_inputs(InputState *s) noexcept nogil
 cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint standing) noexcept nogil
+cdef double louder_nm2(const InputLaw *law, const InputState *s) noexcept nogil
 cdef bint in_order(const InputState *s) noexcept nogil
 cdef void bound_inputs(InputState *s, double most) noexcept nogil
 

@@ -34,9 +34,11 @@ the same sample. A step of a reading is in order where it continues the last ste
     longer  = samples by which a run of equal ones at rest is longer than healthy noise gives with exp(-RARE); their mean
               is that of runs at rest, of channels that have been noisy
     doubt   = max(|off|, |unseen|) - TOLERANCE, or LOAD_HZ longer dt: how far the fastest load may have gone
+    louder  = mean square of the second differences of theta_m/G - theta_l, by 6, less SURELY times what the file's sigma has
 
-The noise is learned from steps in order. After STRANGE samples out of order `off` is the sum of noise, and fades. In motion it is
-bounded by what the current path leaves possible.
+Of white noise, and of counts that are passed quickly, a second difference has six times the variance; of a motion it has nothing,
+because both encoders have it. The noise is learned from steps in order. After STRANGE samples out of order `off` is the sum of
+noise, and fades. In motion it is bounded by what the current path leaves possible.
 
 **Contacts**: a sudden external torque on the link, from the link's momentum. Figures and limits: docs/estimator.md.
 
@@ -232,6 +234,8 @@ cdef double NOISE_SIGMAS = 6.5  # of a second difference: once in hours
 cdef double ROUNDING = 1e-6  # [Nm], of float64: no count is as small
 cdef double COUNTS = 1.5  # of an encoder, by which its steps differ however smooth the motion
 cdef double NOISE_S = 1.0  # in which the noise of a channel is learned
+cdef double PER_NOISE = 6.0  # variance of a second difference by that of white noise
+cdef double SURELY = 1.2  # times the file's variance: four standard errors of what is measured in NOISE_S
 cdef double FASTER = 2.0  # rated torques that accelerate the rotor
 cdef double TOLERANCE = 0.025  # of the rated torque
 cdef double LOAD_HZ = 25.0  # rated torques per second of the fastest load
@@ -246,7 +250,8 @@ cdef double FOLLOW_RATE = 50.0  # at which the torque follows the current
 cdef double RARE_EQUAL = 10.0, RARE_STILL = 14.0
 
 
-cdef int fill_inputs(InputLaw *law, joint, torsion) except -1:
+cdef int fill_inputs(InputLaw *law, joint, torsion, double noise) except -1:
+    """Set the parameters; noise: variance of both readings that the file's sigma has [Nm^2]."""
     law.used = torsion is not None
     if not law.used:
         return 0
@@ -256,12 +261,14 @@ cdef int fill_inputs(InputLaw *law, joint, torsion) except -1:
     law.acceleration = law.link * FASTER * joint.rated_torque_nm / (joint.rotor_inertia_kgm2 * joint.gear_ratio**2)
     law.tolerance = TOLERANCE * joint.rated_torque_nm
     law.most = MOST * joint.rated_torque_nm
+    law.noise = noise
     law.load_rate = LOAD_HZ * joint.rated_torque_nm
     return 0
 
 
-cdef void restart_inputs(InputState *s) noexcept nogil:
+cdef void restart_inputs(const InputLaw *law, InputState *s) noexcept nogil:
     memset(s, 0, sizeof(InputState))
+    s.noise = PER_NOISE * law.noise
 
 
 cdef void drop_inputs(InputState *s) noexcept nogil:
@@ -271,12 +278,12 @@ cdef void drop_inputs(InputState *s) noexcept nogil:
 
 
 cdef double _channel(
-    Channel *c, double reading, double expected, double faster, double acceleration, double dt, bint calm
+    Channel *c, double reading, double expected, double faster, double acceleration, double dt, bint calm, double *bend
 ) noexcept nogil:
     """Take a reading [Nm]; return what it may be off by [Nm].
 
     expected: its step by the drive's velocity, and faster: how much more that is than the last; calm: nothing was out of order
-    lately, so that its noise is that of a healthy channel.
+    lately, so that its noise is that of a healthy channel; bend: set to the second difference, NaN where that is not in order.
     """
     cdef double step = reading - c.last, by_rate = step - c.rate * dt, by_velocity = step - c.unseen - expected
     cdef double limit = max(acceleration * dt * dt, NOISE_SIGMAS * sqrt(c.noise)), change = fabs(step - c.step)
@@ -284,6 +291,7 @@ cdef double _channel(
         c.quantum = change
     limit = max(limit, COUNTS * c.quantum)
     c.last = reading
+    bend[0] = by_rate if fabs(by_rate) <= limit else NAN
     if step == 0.0:
         c.unseen += expected
         c.step, c.rate = 0.0, expected / dt
@@ -323,12 +331,14 @@ cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint
     cdef double dt = x.dt_s, current = law.current * x.current_a
     cdef double expected = law.motor * x.motor_velocity_rad_s * dt, faster = expected - s.velocity
     cdef double motor = law.motor * x.motor_position_rad, link = law.link * x.link_position_rad
-    cdef double doubt, longer, off = s.motor.off + s.link.off
+    cdef double doubt, longer, off = s.motor.off + s.link.off, bend, other
     cdef bint equal, link_still = link == s.link.last, calm = in_order(s)
     if not s.going or not 0.0 < dt <= LONGEST_STEP_S or not isfinite(motor + link + expected + current):
         s.going = isfinite(motor + link + expected + current)
         s.motor.last, s.link.last, s.velocity, s.current = motor, link, expected, x.current_a
         s.motor.rate = s.link.rate = law.motor * x.motor_velocity_rad_s
+        s.motor.step = s.link.step = NAN
+        s.noise = PER_NOISE * law.noise
         s.still_nm = current
         s.link_runs.still = s.runs.still = 0
         s.motor.unseen = s.link.unseen = 0.0
@@ -336,8 +346,8 @@ cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint
     equal = link_still and motor == s.motor.last and x.current_a == s.current and expected == s.velocity
     if link_still and s.link.step != 0.0:
         s.still_nm = current
-    doubt = _channel(&s.motor, motor, expected, faster, law.acceleration, dt, calm)
-    doubt = max(doubt, _channel(&s.link, link, expected, faster, law.acceleration, dt, calm))
+    doubt = _channel(&s.motor, motor, expected, faster, law.acceleration, dt, calm, &bend)
+    doubt = max(doubt, _channel(&s.link, link, expected, faster, law.acceleration, dt, calm, &other))
     if link_still:
         doubt = max(
             doubt,
@@ -356,10 +366,18 @@ cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint
         or fabs(s.link.unseen) > UNSEEN * law.tolerance + COUNTS * s.link.quantum
     ):
         s.strange += 1.0
+    bend -= other
+    if calm and not isnan(bend):
+        s.noise += (bend * bend - s.noise) * min(dt / NOISE_S, 1.0)
     if s.strange > STRANGE:
         s.motor.off *= 1.0 - min(dt * UNKNOWN_RATE, 1.0)
         s.link.off *= 1.0 - min(dt * UNKNOWN_RATE, 1.0)
     s.doubt = min(max(doubt, s.doubt * (1.0 - min(dt * SETTLE_RATE, 1.0))), law.most)
+
+
+cdef double louder_nm2(const InputLaw *law, const InputState *s) noexcept nogil:
+    """Return the variance of both readings [Nm^2], by the second differences of the twist, beyond that of the file."""
+    return max(s.noise / PER_NOISE - SURELY * law.noise, 0.0)
 
 
 cdef bint in_order(const InputState *s) noexcept nogil:

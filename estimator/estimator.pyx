@@ -13,7 +13,8 @@ from libc.math cimport NAN, fabs, fmin, hypot, sqrt
 from libc.string cimport memcmp, memcpy, memset
 
 from jtqd.estimator.detection cimport (
-    LinkLoad, bound_inputs, check_inputs, drop_inputs, fill_inputs, fill_link, in_order, restart_inputs, restart_link, update_link
+    LinkLoad, bound_inputs, check_inputs, drop_inputs, fill_inputs, fill_link, in_order, louder_nm2, restart_inputs, restart_link,
+    update_link
 )
 from jtqd.estimator.observer cimport (
     FusedObserved, FusedObserverLaw, Observed, Sample, fill_fused_observer, fill_guard, fill_observer, observe,
@@ -323,7 +324,8 @@ cdef class FusedEstimator(Estimator):
         fill_offsets(&self.law.offsets, per_ampere, joint.rated_torque_nm, fused, settings.track_zeros, estimated)
         fill_agreement(&self.law.agreement, fused.agreement, joint.rated_torque_nm)
         fill_link(&self.law.link, joint, fused.torsion)
-        fill_inputs(&self.law.inputs, joint, fused.torsion)
+        noise = self.law.tracking_noise if self.law.tracked else self.law.fusion.torsion
+        fill_inputs(&self.law.inputs, joint, fused.torsion, noise)
         fill_proof(&self.law.proof, joint.rated_torque_nm, fused)
         physics_scale = fused.zeros.scale if self.law.offsets.spread > 0.0 else fused.sigma.scale
         network_scale = physics_scale if network is None else network.sigma.scale
@@ -354,7 +356,7 @@ cdef class FusedEstimator(Estimator):
         restart_offsets(&self.law.offsets, &self.state.offsets)
         restart_agreement(&self.state.agreement)
         restart_link(&self.state.link)
-        restart_inputs(&self.state.inputs)
+        restart_inputs(&self.law.inputs, &self.state.inputs)
         restart_proof(&self.law.proof, &self.state.proof)
 
     @property
@@ -494,7 +496,7 @@ cdef class FusedEstimator(Estimator):
         cdef FusedState *s = &self.state
         cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
         cdef double scale, view, trusted = 1.0, difference, known = 0.0, early = 1.0, share = 1.0
-        cdef double spread, more, mismatch, variance, unproven
+        cdef double spread, more, mismatch, variance, unproven, noise, stiffer
         cdef bint standing = out.status == STANDSTILL, alone = not law.fusion.with_torsion
         cdef int quadrant = quadrant_of(raw, v)
         cdef Loss loss
@@ -567,6 +569,10 @@ cdef class FusedEstimator(Estimator):
             variance = self.half_interval(seen, &physics, loss.half, more, sqrt(variance)) ** 2
         if law.tracked and out.status != STANDSTILL:  # measured in motion; of the torsion, by its share
             variance += share * (law.tracking_noise + law.tracking_viscous * v * v / (1.0 + law.tracking_bend * v * v))
+        noise = louder_nm2(&law.inputs, &s.inputs)
+        if noise > 0.0:
+            stiffer = local_stiffness(&law.observer, s.observer.d) * best.alpha / law.observer.stiffness
+            variance += stiffer * stiffer * noise  # the spring of the torsion may be stiffer under load
         unproven = unproven_nm2(&law.proof, unproven, best.alpha, s.offsets.now.link_rad, seen.ahead_nm)
         out.sigma_nm = sqrt(variance + unproven + s.inputs.doubt * s.inputs.doubt)
         publish_within(out, law.limit)

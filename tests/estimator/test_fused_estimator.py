@@ -309,6 +309,29 @@ def test_more_than_three_times_rated_is_invalid() -> None:
 # ---- two views that disagree
 
 
+def test_an_encoder_that_is_noisier_than_the_files_widens_sigma_by_its_noise() -> None:
+    """13 µrad of white noise are 0.16 Nm; less what the file knows of, which alone widens nothing."""
+    joint = replace(NARROW, fused=replace(NARROW.fused, tracking=TRACKING, agreement=None))  # type: ignore[type-var]
+    loss = AdditiveLossModel(joint.fused.loss).loss(GAIN * 3.0, 1.0, 0.0)[0]  # type: ignore[union-attr]
+    torsion_nm = GAIN * 3.0 - loss
+    n, rng, runs = 4000, np.random.default_rng(4), []
+    for noise_rad in (0.0, 6e-6, 13e-6):
+        link = 1e-3 * np.arange(n)
+        motor, read = 100.0 * (link + torsion_nm / K), link + rng.normal(0.0, noise_rad, n)
+        columns = np.full(n, 3.0), motor, np.full(n, 100.0), read, np.full(n, 25.0)
+        runs.append(FusedEstimator(joint, TRACKED).run(np.full(n, 1e-3), *columns))
+    quiet, usual, noisy = (np.median(run.sigma_nm[2500:] ** 2) for run in runs)
+    alpha = (
+        Fusion(replace(joint.fused.sigma, reference_nm=0.0), True)
+        .fuse(  # type: ignore[union-attr]
+            *np.atleast_1d(GAIN * 3.0, 0.0, 1.0, torsion_nm)
+        )
+        .alpha[0]
+    )
+    assert usual == pytest.approx(quiet, rel=2e-3)
+    assert noisy - quiet == pytest.approx(alpha**2 * ((13e-6 * K) ** 2 - 1.2 * TRACKING.sigma_nm**2), rel=0.15)
+
+
 def test_views_apart_widen_sigma_at_once_and_lower_the_status() -> None:
     """3 standard deviations of their distance are free, sigma is what is more; from 4 on the status is 3."""
     value, sigma, _ = physics(3.0, 1.0, 5.0, joint=NARROW)

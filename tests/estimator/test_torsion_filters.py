@@ -263,10 +263,10 @@ def test_sigma_covers_what_is_faster_than_the_motor_path() -> None:
     bare, wide, viscous, bent = (
         FusedEstimator(following(joint, replace(TRACKING, **changes)), TRACKED).run(*m.arrays())
         for changes in (
-            {"sigma_nm": 0.0, "viscous_nms_per_rad": 0.0},
-            {"sigma_nm": 3.0, "viscous_nms_per_rad": 0.0},
-            {"sigma_nm": 0.0, "viscous_nms_per_rad": 0.5},
-            {"sigma_nm": 0.0, "viscous_nms_per_rad": 0.5, "saturation_rad_s": 0.4},
+            {"sigma_nm": 4.0, "viscous_nms_per_rad": 0.0},
+            {"sigma_nm": 5.0, "viscous_nms_per_rad": 0.0},
+            {"sigma_nm": 4.0, "viscous_nms_per_rad": 0.5},
+            {"sigma_nm": 4.0, "viscous_nms_per_rad": 0.5, "saturation_rad_s": 0.4},
         )
     )
     for other in (wide, viscous, bent):
