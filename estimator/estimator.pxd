@@ -96,6 +96,7 @@ cdef class FusedEstimator(Estimator):
     cdef void update_path_difference(
         self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
     ) noexcept nogil
+    cdef void look_now(self, FusedObserved *at) noexcept nogil
     cdef bint offset_pending(self) noexcept nogil
     cdef bint inconsistent(self, const Fused *physics, double dt) noexcept nogil
     cdef double half_interval(

@@ -44,7 +44,7 @@ from jtqd.estimator import status as st
 from jtqd.estimator.corrections import ExtendedInputs, acting_effects, plain_joint
 from jtqd.estimator.observer import columns
 from jtqd.estimator.native_network import OUTSIDE
-from jtqd.estimator.network import FEATURES, check_fit, native_of
+from jtqd.estimator.network import FEATURES, check_fit, native_of, path_section
 from jtqd.estimator.run import INPUTS, EstimateRun, ObservedRun
 from jtqd.estimator.settings import METHODS, largest_torque_nm
 from jtqd.estimator.status import Estimate
@@ -297,8 +297,9 @@ cdef class FusedEstimator(Estimator):
         torque  = tau_c + alpha (tau_t - tau_c),   alpha = s_c^2/(s_c^2 + s_t^2),   tau_c = tau_r + N(x)
 
     s_c: its spread, wider where it is not trusted, and the friction interval near standstill. At standstill the torque is that
-    of physics, without torsion tau_c. Offsets and agreement of the paths are those of physics. Where the network has no value
-    the torque is physics, and the status 3; without torsion also where the trust is below one half.
+    of physics, without torsion tau_c. Offsets and agreement are judged by the path that counts, the network's where there is one;
+    where its trust is below one half nothing is learned. Where it has no value the torque is physics, and the status 3;
+    without torsion also where the trust is below one half.
 
     Raises ConfigError for a joint without section `fused`, effects (`make_estimator` applies them), another joint's
     network, or settings of another method; NetworkError for a network whose native evaluation differs from its runtime's.
@@ -307,6 +308,7 @@ cdef class FusedEstimator(Estimator):
     def __init__(self, joint, settings, network=None):
         check_fit(joint, settings, network, "FusedEstimator")
         fused = joint.fused
+        judged = fused if network is None else path_section(fused, network)
         self.joint, self.settings = joint, settings
         self.width = 0 if network is None else PATH_INPUTS
         fill_guard(&self.law.guard, joint, settings)
@@ -315,20 +317,21 @@ cdef class FusedEstimator(Estimator):
         fill_fusion(&self.law.fusion, fused.sigma, fused.torsion is not None)
         self.law.fusion.reference = 0.0  # sigma is that of the torque, not of a comparison with a sensor
         per_ampere = joint.gear_ratio * joint.torque_constant_nm_per_a
-        estimated = fused.agreement is not None
+        estimated = judged.agreement is not None
         self.law.tracked = self.law.observer.tracking > 0.0
         if self.law.tracked:
             self.law.tracking_noise = fused.tracking.sigma_nm**2
             self.law.tracking_viscous = fused.tracking.viscous_nms_per_rad**2
             self.law.tracking_bend = fused.tracking.bend
-        fill_offsets(&self.law.offsets, per_ampere, joint.rated_torque_nm, fused, settings.track_zeros, estimated)
-        fill_agreement(&self.law.agreement, fused.agreement, joint.rated_torque_nm)
+        fill_offsets(&self.law.offsets, per_ampere, joint.rated_torque_nm, judged, settings.track_zeros, estimated)
+        fill_agreement(&self.law.agreement, judged.agreement, joint.rated_torque_nm)
         fill_link(&self.law.link, joint, fused.torsion)
         noise = self.law.tracking_noise if self.law.tracked else self.law.fusion.torsion
         fill_inputs(&self.law.inputs, joint, fused.torsion, noise)
-        fill_proof(&self.law.proof, joint.rated_torque_nm, fused)
-        physics_scale = fused.zeros.scale if self.law.offsets.spread > 0.0 else fused.sigma.scale
-        network_scale = physics_scale if network is None else network.sigma.scale
+        fill_proof(&self.law.proof, joint.rated_torque_nm, judged)
+        learned = self.law.offsets.spread > 0.0
+        physics_scale = fused.zeros.scale if learned and fused.zeros is not None else fused.sigma.scale
+        network_scale = judged.zeros.scale if learned else judged.sigma.scale
         for k in range(4):
             self.law.physics_scale[k], self.law.network_scale[k] = physics_scale[k], network_scale[k]
         self.law.stand_share = 1.0 + settings.friction_uncertainty
@@ -339,9 +342,7 @@ cdef class FusedEstimator(Estimator):
         self.run_one = fill_network(&self.law.network, network, joint)
         if network is not None:
             fill_path(&self.law.path, joint, network)
-            own = network.sigma
-            path = replace(fused.sigma, current_nm=own.current_nm, viscous_nms_per_rad=own.viscous_nms_per_rad, load=own.load)
-            fill_fusion(&self.law.view, path, fused.torsion is not None)
+            fill_fusion(&self.law.view, judged.sigma, fused.torsion is not None)
             self.law.view.reference = 0.0
             self.law.rest, self.law.outside = network.rest_nm, OUTSIDE * joint.rated_torque_nm
         self.law.with_envelope = fused.envelope is not None
@@ -406,7 +407,6 @@ cdef class FusedEstimator(Estimator):
         cdef FusedObserved seen
         cdef LinkLoad link
         cdef Sample corrected
-        cdef const Sample *read = x
         if self.law.inputs.used:
             check_inputs(&self.law.inputs, &self.state.inputs, x, self.state.guard.standing)
         if self.law.offsets.corrected:
@@ -417,11 +417,11 @@ cdef class FusedEstimator(Estimator):
         self.observed = observe_fused(
             &self.law.guard, &self.state.guard, &self.law.observer, &self.state.observer, x, &seen
         )
-        if self.law.network.used and self.state.guard.running:  # trained on readings as they come
+        if self.law.network.used and self.state.guard.running:
             if self.observed:
-                follow_path(&self.law.path, &self.state.path, read, self.features)
+                follow_path(&self.law.path, &self.state.path, x, self.features)
             else:
-                start_path(&self.law.path, &self.state.path, read, self.features)
+                start_path(&self.law.path, &self.state.path, x, self.features)
         no_values(out, self.state.guard.status)
         if self.observed:
             update_link(
@@ -464,7 +464,7 @@ cdef class FusedEstimator(Estimator):
             next = additive_loss(&law.loss, raw + STEP, v, s.thermal, seen.direction)
             update_difference(
                 &law.offsets, &s.offsets, &law.agreement, &s.agreement, local_stiffness(&law.observer, s.observer.d),
-                (next.nm - loss) / STEP
+                (next.nm - additive_loss(&law.loss, raw, v, s.thermal, seen.direction).nm) / STEP
             )
 
     cdef bint inconsistent(self, const Fused *physics, double dt) noexcept nogil:
@@ -490,14 +490,22 @@ cdef class FusedEstimator(Estimator):
             correction = evaluate(&self.law.network.perceptron, self.features) if self.law.network.native else self.ask()
         return self.features[0] + correction
 
+    cdef void look_now(self, FusedObserved *at) noexcept nogil:
+        """Bring torsion, motor torque and waves to the instant of the network's current path."""
+        at.raw_nm, at.torsion_nm, at.ahead_nm = self.features[0], at.torsion_nm + at.ahead_nm, 0.0
+        at.sin1, at.cos1, at.sin2 = self.features[12], self.features[13], self.features[14]
+        at.cos2, at.sin4, at.cos4 = self.features[15], self.features[16], self.features[17]
+
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out`, whose status is the guard's, to the estimate of an observed sample."""
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
         cdef double scale, view, trusted = 1.0, difference, known = 0.0, early = 1.0, share = 1.0
-        cdef double spread, more, mismatch, variance, unproven, noise, stiffer
-        cdef bint standing = out.status == STANDSTILL, alone = not law.fusion.with_torsion
+        cdef double spread, more, mismatch, variance, unproven, lost, noise, stiffer
+        cdef FusedObserved at
+        cdef int status
+        cdef bint by_network, standing = out.status == STANDSTILL, alone = not law.fusion.with_torsion
         cdef int quadrant = quadrant_of(raw, v)
         cdef Loss loss
         cdef Fused physics, best
@@ -505,56 +513,60 @@ cdef class FusedEstimator(Estimator):
             s.temperature = x.temperature_c
             s.thermal = thermal_friction(&law.loss, x.temperature_c)
         loss = additive_loss(&law.loss, raw, v, s.thermal, seen.direction)
+        lost = loss.nm
         s.half = fading(loss.half, s.half, x.dt_s)
         physics = fuse_paths(&law.fusion, raw, loss.nm, s.half, v, seen.torsion_nm, seen.open_nm)
-        degraded = self.inconsistent(&physics, x.dt_s)
-        if out.status == VALID:
-            bound_inputs(&s.inputs, possible_error(&physics))
-        unproven = prove(&law.proof, &s.proof, &physics, seen, x.dt_s, standing, in_order(&s.inputs))
+        best, at, scale, status = physics, seen[0], law.physics_scale[quadrant], out.status
+        view = out.network_nm = self.current_path(network_wanted)
+        by_network = -law.limit <= view <= law.limit  # not so for NaN
+        if by_network:
+            trusted = path_trust(&law.path, &s.path, self.features, x.temperature_c)
+        if by_network and (alone or not standing):  # of now, as the torsion
+            self.look_now(&at)
+            loss.nm = at.raw_nm - view
+            # the friction interval counts where the torsion can take over
+            best = fuse_paths(
+                &law.view, at.raw_nm, loss.nm, hypot(0.0 if alone else s.half, (1.0 - trusted) * law.outside), v,
+                at.torsion_nm, at.open_nm
+            )
+            scale = law.network_scale[quadrant]
+        degraded = self.inconsistent(&best, x.dt_s)
+        if status == VALID:
+            bound_inputs(&s.inputs, possible_error(&best))
+        unproven = prove(&law.proof, &s.proof, &best, &at, x.dt_s, standing, in_order(&s.inputs))
+        if law.network.used and status == VALID and not (by_network and trusted > 0.5):
+            status = DEGRADED  # nothing is learned from a path that is not trusted
         if law.offsets.estimated:
             if not in_order(&s.inputs):
                 go_back(&s.offsets)
-            elif out.status == VALID and fabs(seen.direction) > ONE_SIDED:
-                keep_offsets(
-                    &law.offsets, &s.offsets, &s.agreement, &physics, fmin(fabs(raw), fabs(seen.torsion_nm)), x.dt_s
-                )
-            self.update_path_difference(seen, x, &physics, loss.nm, out.status)
+            elif status == VALID and fabs(at.direction) > ONE_SIDED:
+                keep_offsets(&law.offsets, &s.offsets, &s.agreement, &best, fmin(fabs(at.raw_nm), fabs(at.torsion_nm)), x.dt_s)
+            self.update_path_difference(&at, x, &best, loss.nm, status)
         if law.offsets.spread > 0.0:
             known = known_nm2(&law.offsets, &s.offsets)
             reweigh(&physics, known)
+            reweigh(&best, known)
             early = early_factor(&law.offsets, known)
         out.physics_nm = physics.value + seen.ahead_nm  # paths fused at the same delay, then advanced by the torsion
+        out.torque_nm = best.value + at.ahead_nm
         # at rest the current path is only an interval, and its distance to the torsion is no evidence against the file
-        difference = 0.0 if standing else seen.torsion_nm - (raw - loss.nm)
+        difference = 0.0 if standing else seen.torsion_nm - (raw - lost)
         if law.with_envelope:
             # the fit is known up to half the weight; the same motor torque holds more load when back-driven
             if fabs(physics.value) > law.trust.load or fused_trust(&law.trust, v, raw, difference, x.temperature_c) < 0.5:
                 degraded = True
-        best, out.torque_nm, scale = physics, out.physics_nm, law.physics_scale[quadrant]
-        view = out.network_nm = self.current_path(network_wanted)
-        if -law.limit <= view <= law.limit:  # not so for NaN
-            trusted = path_trust(&law.path, &s.path, self.features, x.temperature_c)
-            if alone or not standing:
-                # the friction interval counts where the torsion can take over
-                best = fuse_paths(
-                    &law.view, raw, raw - view, hypot(0.0 if alone else s.half, (1.0 - trusted) * law.outside), v,
-                    seen.torsion_nm + seen.ahead_nm, seen.open_nm
-                )
-                if law.offsets.spread > 0.0:
-                    reweigh(&best, known)
-                out.torque_nm, scale, share = best.value, law.network_scale[quadrant], best.alpha * best.alpha
-            if alone and trusted < 0.5:
-                degraded = True
-        elif law.network.used:
+        if law.network.used and (not by_network or (alone and trusted < 0.5)):
             degraded = True
+        if by_network and not standing:
+            share = best.alpha * best.alpha
         spread = scale * best.sigma * early
         # an uncorrected offset counts once: as mismatch, where the file has section agreement
         more = apart_nm2(&best, 0.0 if law.agreement.used else s.offsets.uncorrected_nm)
         variance = spread * spread + more
         if law.agreement.used:
-            mismatch = mismatch_variance(&s.agreement, best.alpha, seen.torsion_nm)
+            mismatch = mismatch_variance(&s.agreement, best.alpha, at.torsion_nm)
             if degrades(
-                &law.agreement, &s.agreement, &s.offsets, mismatch, sqrt(variance), best.alpha, seen.torsion_nm
+                &law.agreement, &s.agreement, &s.offsets, mismatch, sqrt(variance), best.alpha, at.torsion_nm
             ):
                 s.degraded_s, degraded = LOWERED_S, True
             more += mismatch
@@ -573,7 +585,7 @@ cdef class FusedEstimator(Estimator):
         if noise > 0.0:
             stiffer = local_stiffness(&law.observer, s.observer.d) * best.alpha / law.observer.stiffness
             variance += stiffer * stiffer * noise  # the spring of the torsion may be stiffer under load
-        unproven = unproven_nm2(&law.proof, unproven, best.alpha, s.offsets.now.link_rad, seen.ahead_nm)
+        unproven = unproven_nm2(&law.proof, unproven, best.alpha, s.offsets.now.link_rad, at.ahead_nm)
         out.sigma_nm = sqrt(variance + unproven + s.inputs.doubt * s.inputs.doubt)
         publish_within(out, law.limit)
 

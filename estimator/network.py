@@ -26,6 +26,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Any, ClassVar, Final, NamedTuple, TypeVar
@@ -36,7 +37,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.decoder import FieldError, read
 from jtqd.estimator.errors import ConfigError, OneLineError
 from jtqd.estimator.files import read_file
-from jtqd.estimator.joint import Envelope, FusedSigma, Joint
+from jtqd.estimator.joint import Agreement, DayZeros, Envelope, Fused, FusedSigma, Joint
 from jtqd.estimator.native_network import INPUTS, Perceptron
 from jtqd.estimator.settings import METHODS, EstimatorSettings, tracking_of
 from jtqd.estimator.text import sha256_hex
@@ -49,12 +50,13 @@ FEATURES: Final = (
     "link_velocity_rad_s",
     "efficiency_torque_nm",
 )
-Section = TypeVar("Section", Envelope, FusedSigma)
+Section = TypeVar("Section", Envelope, FusedSigma, DayZeros, Agreement)
 NATIVE_LIMIT: Final = 1e-6
 """Largest difference between native evaluation and ONNX Runtime, in rated torques."""
 
 PERCEPTRON: Final = "perceptron"
 """Key of the metadata that holds the weights."""
+_OPTIONAL: Final = {PERCEPTRON, "zeros", "agreement"}
 _WARM_UP: Final = 50
 _LONGEST_S: Final = 5.0
 """Processor time of this process for each step before the first use: a busy machine is no endless loop."""
@@ -243,7 +245,7 @@ class _Graph:
         except UnicodeDecodeError as error:
             raise self._error(f"metadata: found bytes that are not UTF-8 ({error.reason})") from None
         metadata: dict[str, Any] = {}
-        for key in ("features", *keys, *({PERCEPTRON} & raw.keys())):
+        for key in ("features", *keys, *(_OPTIONAL & raw.keys())):
             if key not in raw:
                 raise self._error(f"metadata '{key}': missing, found only {sorted(raw)}")
             try:
@@ -455,7 +457,7 @@ class PathNetwork(Network):
     Metadata besides those of `Network`: input_low and input_high (range of the training data per input), envelope
     (`Envelope`), sigma (`FusedSigma` of the current path, and the factors on sigma of the estimate), rest_nm (half width of
     the interval of one encoder at rest), quick (largest acceleration [rad/s^2], |tau_r at 800 rad/s - tau_r| and
-    |tau_r at 50 rad/s - tau_r| [Nm]).
+    |tau_r at 50 rad/s - tau_r| [Nm]). Perhaps zeros and agreement (`DayZeros`, `Agreement`) of it and the torsion.
     """
 
     features = INPUTS
@@ -470,6 +472,9 @@ class PathNetwork(Network):
         super().__init__(source, sha256, check)
         self.envelope: Final = self._section(Envelope, "envelope")
         self.sigma: Final = self._section(FusedSigma, "sigma")
+        has = self.metadata.keys()
+        self.zeros: Final = self._section(DayZeros, "zeros") if "zeros" in has else None
+        self.agreement: Final = self._section(Agreement, "agreement") if "agreement" in has else None
         self.rest_nm, *quick = self.numbers("rest_nm", 1) + self.numbers("quick", 3)
         self.quick: Final = tuple(quick)
         if min(self.rest_nm, *quick) <= 0.0:
@@ -483,6 +488,27 @@ class PathNetwork(Network):
         except FieldError as error:
             where = f"{error.key}: " if error.key else ""
             raise self.error(f"metadata '{key}': {where}{error.problem}{error.others}") from None
+
+
+def path_section(fused: Fused, network: PathNetwork) -> Fused:
+    """Return a joint's section with the network's current path in place of its loss: sigma, day's offsets, agreement.
+
+    Of a network whose runs had no torsion, or that does not know them, those of the section, without the waves of its loss.
+    """
+    own, zeros, agreement = network.sigma, fused.zeros, fused.agreement
+    sigma = replace(
+        fused.sigma,
+        current_nm=own.current_nm,
+        viscous_nms_per_rad=own.viscous_nms_per_rad,
+        load=own.load,
+        scale=own.scale,
+    )
+    if getattr(network, "agreement", None) is not None:
+        zeros, agreement = network.zeros, network.agreement
+    else:
+        zeros = None if zeros is None else replace(zeros, scale=own.scale)
+        agreement = None if agreement is None else replace(agreement, turn=None)
+    return replace(fused, sigma=sigma, zeros=zeros, agreement=agreement)
 
 
 AnyNetwork = TorqueNetwork | PathNetwork

@@ -113,6 +113,7 @@ class PathResiduals(NamedTuple):
     through the low pass of new configurations, against the unfiltered sensor: for `fused.tracking`.
     loss_nm, turn [n, 6] (filtered cos and sin of 1, 2 and 4 times the motor angle): for `fused.agreement.turn`.
     ahead: of the tracked torsion to the delayed one. resting: standing. counted: in motion, and settled.
+    now: the current path is no older than the tracked torsion; empty: it is, by the motor path's filter.
     """
 
     raw_nm: FloatArray
@@ -135,6 +136,7 @@ class PathResiduals(NamedTuple):
     ahead_nm: FloatArray = NONE
     resting: BoolArray = NEVER
     counted: BoolArray = NEVER
+    now: BoolArray = NEVER
 
     @property
     def in_motion(self) -> PathResiduals:
@@ -232,7 +234,8 @@ class FusedErrors(NamedTuple):
     """Errors of the estimator in one run, arrays [n] of its samples in motion.
 
     undelayed: with the torsion tracked. spread: standard deviation of the torque, scale 1. more: what the estimator adds to
-    it. known: what the tracked offset takes off the torsion's variance. teacher: of `PathResiduals`.
+    it. known: what the tracked offset takes off the torsion's variance. teacher: of `PathResiduals`. share: of the noise of
+    the tracked torsion in the variance: all where it is put on top of a delayed fusion, else by its weight.
     """
 
     error_nm: FloatArray
@@ -243,6 +246,7 @@ class FusedErrors(NamedTuple):
     quadrant: QuadrantArray
     known_nm2: FloatArray
     teacher_nm: FloatArray = NONE
+    share: FloatArray = NONE
 
 
 def fused_errors(
@@ -283,6 +287,7 @@ def fused_errors(
         quadrants(run.raw_nm, run.velocity_rad_s),
         known,
         run.teacher_nm,
+        np.where(run.now, alpha * alpha, 1.0) if len(run.now) else np.ones(len(alpha)),
     )
     return _only(errors, run.counted)
 
@@ -629,8 +634,8 @@ def _beyond(
         error, more = run.error_nm, run.more_nm2
         if tracking is not None:
             error = run.undelayed_nm
-            more = more + tracking.sigma_nm**2
-            more += tracking.viscous_nms_per_rad**2 * bent_square(run.velocity_rad_s, tracking.bend)
+            bent = bent_square(run.velocity_rad_s, tracking.bend)
+            more = more + run.share * (tracking.sigma_nm**2 + tracking.viscous_nms_per_rad**2 * bent)
         doubt = np.hypot(doubt_nm, run.teacher_nm) if len(run.teacher_nm) else doubt_nm
         error = error - offset + doubt * normal[np.arange(len(error)) % _QUANTILES]
         beyond.append(np.sqrt(np.maximum(error**2 - GAUSS**2 * more, 0.0)))

@@ -11,23 +11,27 @@ sigma of the estimate in service, and the gate: its RMSE must be lower than with
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.decoder import plain_values
-from jtqd.estimator.estimator import estimate_columns, quadrants
+from jtqd.estimator.estimator import SLOPE_NM, estimate_columns, observe_run, quadrants
+from jtqd.estimator.fusion import faded
 from jtqd.estimator.joint import Envelope, FusedSigma, Joint
+from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.native_network import INPUTS
 from jtqd.estimator.network import PathNetwork
-from jtqd.estimator.run import JointColumns
+from jtqd.estimator.run import INPUTS as COLUMNS
+from jtqd.estimator.run import JointColumns, ObservedRun
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.estimator.text import counted
-from jtqd.sysid.fit.calibration import FEWEST, PathResiduals, conformal_scale, fit_sigma
-from jtqd.sysid.fit.fused import map_of
+from jtqd.sysid.fit.calibration import FEWEST, PathResiduals, calibrated, conformal_scale, fit_sigma
+from jtqd.sysid.fit.fused import fit_agreement, fit_zeros, map_of
+from jtqd.sysid.fit.torsion import local_stiffness
 from jtqd.sysid.train.network import (
     HIDDEN,
     Layer,
@@ -53,6 +57,7 @@ QUICK_MARGIN: Final = 1.1
 REST_COVERAGE: Final = 0.95
 _SETTINGS: Final = recommended("fused")
 _BASE, _VELOCITY = INPUTS.index("torque_nm"), INPUTS.index("velocity_rad_s")
+_TURN: Final = tuple(INPUTS.index(f"{part}_{order}_motor") for order in (1, 2, 4) for part in ("cos", "sin"))
 _QUICK: Final = tuple(map(INPUTS.index, ("acceleration_rad_s2", "torque_800_nm", "torque_50_nm")))
 
 
@@ -256,12 +261,77 @@ def train_path(
         "quick": (QUICK_MARGIN * np.quantile(np.abs(every[:, _QUICK]), QUICK_SHARE, axis=0)).tolist(),
         **origin(joint, hashes),
     }
-    scores, scale = _in_service(
-        [runs[n] for n in held], joint, PathNetwork(export_network(trained, metadata))
-    )
-    metadata["sigma"]["scale"] = list(scale)
+    if joint.fused.torsion is not None:
+        metadata |= _section(
+            [_paths(runs[n], views[n], trained, joint) for n in held], joint, metadata["sigma"]
+        )
+    network = PathNetwork(export_network(trained, metadata))
+    scores, scale = _in_service([runs[n] for n in held], joint, network)
+    if joint.fused.torsion is None:
+        metadata["sigma"]["scale"] = list(scale)
     metadata["gate"] = gate_of(scores).to_mapping()
     return TrainedNetwork(export_network(trained, metadata), trained, metadata, scores)
+
+
+def _paths(run: PathRun, inputs: FloatArray, trained: Trained, joint: Joint) -> PathResiduals:
+    """Return the errors of the network's current path and of the torsion, both of now, on all observed samples of a run."""
+    assert joint.fused is not None
+    assert joint.fused.torsion is not None
+    columns, sensor, time_s = run.columns, _sensor(run), run.time_s
+    dt = np.diff(time_s, prepend=time_s[0])
+    current, motor, velocity, link = (np.asarray(getattr(columns, name)) for name in COLUMNS)
+    seen = observe_run(
+        joint, _SETTINGS, joint.fused.torsion, dt, current, motor, velocity, link, columns.temperature_c
+    )
+    keep = ~np.isnan(seen.raw_nm) & np.isfinite(inputs).all(axis=1)
+    inputs, seen = inputs[keep], ObservedRun(*(getattr(seen, each.name)[keep] for each in fields(seen)))
+    torsion, base, error = (
+        seen.torsion_nm + seen.ahead_nm,
+        inputs[:, _BASE],
+        estimate_nm(trained, inputs) - sensor[keep],
+    )
+    loss = AdditiveLossModel(joint.fused.loss)
+    now, half = loss.loss_many(base, seen.velocity_rad_s, seen.temperature_c, seen.direction)
+    more, _ = loss.loss_many(base + SLOPE_NM, seen.velocity_rad_s, seen.temperature_c, seen.direction)
+    off = torsion - sensor[keep]
+    none = np.zeros(len(base))
+    return PathResiduals(
+        base,
+        seen.velocity_rad_s,
+        faded(half, seen.dt_s, none == 0.0),
+        torsion,
+        seen.open_nm,
+        error,
+        off,
+        dt_s=seen.dt_s,
+        direction=seen.direction,
+        slope=(more - now) / SLOPE_NM,
+        tracked_nm=off,
+        delayed_nm=off,
+        stiffness_nm_per_rad=local_stiffness(
+            joint.fused.torsion, torsion / joint.fused.torsion.stiffness_nm_per_rad
+        ),
+        loss_nm=base - error - sensor[keep],
+        turn=inputs[:, _TURN],
+        teacher_nm=none,
+        ahead_nm=none,
+        resting=seen.status == STANDSTILL,
+        now=none == 0.0,
+        counted=(seen.status == VALID) & (time_s[keep] - time_s[0] >= SETTLE_S),
+    )
+
+
+def _section(runs: Sequence[PathResiduals], joint: Joint, sigma: Mapping[str, Any]) -> dict[str, Any]:
+    """Return metadata of held-out runs: sigma with its scale, zeros and agreement of the current path and the torsion."""
+    assert joint.fused is not None
+    runs = [run for run in runs if np.count_nonzero(run.counted) >= FEWEST]
+    moving, rated_nm = [run.in_motion for run in runs], joint.rated_torque_nm
+    known = {key: sigma[key] for key in ("current_nm", "viscous_nms_per_rad", "load", "scale")}
+    fused = replace(joint.fused, sigma=replace(joint.fused.sigma, **known), zeros=None, agreement=None)
+    fused = replace(fused, zeros=fit_zeros(moving, fused, rated_nm))
+    fused = calibrated(runs, replace(fused, agreement=fit_agreement(moving, fused, rated_nm)), rated_nm)
+    parts = {"sigma": fused.sigma, "zeros": fused.zeros, "agreement": fused.agreement}
+    return {key: plain_values(part) for key, part in parts.items() if part is not None}
 
 
 def _sensor(run: PathRun) -> FloatArray:

@@ -329,7 +329,9 @@ def test_an_encoder_that_is_noisier_than_the_files_widens_sigma_by_its_noise() -
         .alpha[0]
     )
     assert usual == pytest.approx(quiet, rel=2e-3)
-    assert noisy - quiet == pytest.approx(alpha**2 * ((13e-6 * K) ** 2 - 1.2 * TRACKING.sigma_nm**2), rel=0.15)
+    assert noisy - quiet == pytest.approx(
+        alpha**2 * ((13e-6 * K) ** 2 - 1.2 * TRACKING.sigma_nm**2), rel=0.15
+    )
 
 
 def test_views_apart_widen_sigma_at_once_and_lower_the_status() -> None:

@@ -49,7 +49,9 @@ from tests.estimator.fused_helpers import (
     OFF,
     ON,
     SIGMA,
+    TRACKING,
     USUAL,
+    FakeNetwork,
     K,
     driven,
     wavier,
@@ -721,6 +723,25 @@ def test_waves_that_are_not_the_files_widen_sigma_by_their_size_and_its_own_by_n
     more = np.sqrt(foreign.sigma_nm**2 - without.sigma_nm**2)[late]
     assert 0.5 * 0.9 * 0.7 / math.sqrt(2.0) < np.median(more) < 1.05 * 0.7 / math.sqrt(2.0)
     np.testing.assert_allclose(known.sigma_nm[late], without.sigma_nm[late], rtol=1e-3)
+
+
+@pytest.mark.parametrize("counted", [True, False])
+def test_a_network_is_judged_by_the_difference_that_it_leaves(counted: bool) -> None:
+    """With levels of its own that of its path, with none those of the file, without the waves of the file's loss."""
+    assert NARROW.fused is not None
+    loss = AdditiveLossModel(NARROW.fused.loss)
+
+    def answer(*x: float) -> float:
+        return -loss.loss(x[0], x[5], loss.thermal(x[11]))[0]
+
+    network: Any = FakeNetwork(answer)
+    network.sigma = replace(network.sigma, current_nm=0.2)
+    if counted:
+        network.zeros, network.agreement = None, replace(LARGE, turn=TURN)
+    following = replace(NARROW, fused=replace(joint_of(None).fused, tracking=TRACKING))  # type: ignore[type-var]
+    found = FusedEstimator(following, replace(ON, track_torsion=True), network)
+    columns = with_wave(2, "constant_nm", 3.0)
+    assert (first_degraded_s(found.run(*columns)) < 1.0) == counted
 
 
 def test_a_file_without_the_key_is_as_before() -> None:

@@ -135,6 +135,24 @@ def test_a_network_of_runs_gives_the_torque_and_holds_its_interval(made):
     assert np.mean(moving | rest) > 0.85
 
 
+def test_of_two_encoders_the_network_has_the_agreement_of_its_path_with_the_torsion():
+    """On held-out runs: the difference that it leaves, which is not the 1.5 Nm of the joint file's loss."""
+
+    def twisted(run):
+        spring = PLAIN.fused.torsion.stiffness_nm_per_rad
+        link = run.columns.link_position_rad - run.columns.torque_nm / spring
+        return run._replace(columns=replace(run.columns, link_position_rad=link))
+
+    runs = [twisted(a_run(seed)) for seed in range(12)]
+    none = {"orders_per_motor_rev": (), "cos_rad": (), "sin_rad": ()}
+    torsion = replace(PLAIN.fused.torsion, cubic_nm_per_rad3=0.0, zero_rad=0.0, **none)
+    joint = replace(PLAIN, fused=replace(PLAIN.fused, torsion=torsion))
+    found = PathNetwork(train_path(runs, joint, {run.name: HASHES[run.name] for run in runs}, SHORT).data)
+    assert found.agreement is not None
+    assert found.agreement.slow_nm < 0.5
+    assert min(found.sigma.scale) > 0.0
+
+
 def test_envelope_temperatures_and_quickness_are_those_of_the_runs(made):
     network = PathNetwork(made.data)
     temperatures = [run.columns.temperature_c[0] for run in RUNS]
