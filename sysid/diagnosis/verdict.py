@@ -51,7 +51,7 @@ from jtqd.sysid.diagnosis.findings import (
 from jtqd.sysid.diagnosis.model import Solution, recorded
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.regressors import Index, RunData, contribution
-from jtqd.sysid.diagnosis.signals import Channel
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 from jtqd.sysid.diagnosis.unexplained import (
     Unexplained,
     channel_gaps,
@@ -326,18 +326,27 @@ def judged(solution: Solution) -> list[Judged]:
 
 
 def _rms(solution: Solution, present: Present) -> dict[Channel, float]:
-    """Return the rms of an effect per channel where the balances of all runs are judged, however quick it is; a constant in
-    torsion taken off.
+    """Return the rms of an effect per channel where the balances of all runs are judged, less what noise puts into it; a
+    constant in torsion taken off. Of a wave, which the angle gives however quick it is, all; else what is seen.
     """
+    wave = "order_per_motor_rev" in present.values
+    noisy = {(s.run, s.number): s for run in solution.dataset.disturbed for s in run}
+
+    def parts(s: JointSignals) -> dict[str, FloatArray]:
+        made = contribution(present.effect, present.values, s)
+        return {balance: x if wave else s.visible(x) for balance, x in made.items()}
+
     squares: dict[Channel, list[FloatArray]] = {}
     for s in (s for run in solution.dataset.signals for s in run if shows_at(present.joint, s.number)):
-        for balance, value in contribution(present.effect, present.values, s).items():
-            part = np.broadcast_to(value, s.time_s.shape)[s.usable(balance)]
+        again = parts(noisy.get((s.run, s.number), s))
+        for balance, value in parts(s).items():
+            part, noise = (x[s.usable(balance)] for x in (value, again[balance] - value))
             if balance == TORSION and len(part):
-                part = part - part.mean()
-            squares.setdefault(Channel(s.number, balance), []).append(part * part)
+                part, noise = part - part.mean(), noise - noise.mean()
+            squares.setdefault(Channel(s.number, balance), []).append(part**2 - noise**2)
     return {
-        c: float(np.sqrt(np.mean(np.concatenate(x)))) if sum(map(len, x)) else 0.0 for c, x in squares.items()
+        c: math.sqrt(max(float(np.mean(np.concatenate(x))), 0.0)) if sum(map(len, x)) else 0.0
+        for c, x in squares.items()
     }
 
 

@@ -15,11 +15,13 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Friction
 from jtqd.sysid.diagnosis import verdict
 from jtqd.sysid.diagnosis.evidence import Sets
-from jtqd.sysid.diagnosis.findings import CERTAIN, EFFECTIVE, ONE_OF
+from jtqd.sysid.diagnosis.findings import CERTAIN, EFFECTIVE, ONE_OF, Present
 from jtqd.sysid.diagnosis.model import _STATES, Solution
+from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.verdict import (
     Prediction,
     Sizes,
+    _rms,
     gain_of,
     grade_of,
     judged,
@@ -304,3 +306,18 @@ def test_a_discrepancy_that_resembles_a_value_widens_its_interval_and_takes_noth
     assert low < weak.torque_constant_nm_per_a < high
     shrunk = found.sets.fit(found.chosen).mean / found.plain.fit(found.chosen).mean
     assert np.all(shrunk[found.sets.places(found.chosen)[j.members[0]]] < 0.95), "else this shows nothing"
+
+
+def test_an_effect_of_a_rate_is_worth_nothing_of_the_noise() -> None:
+    """The current that a simulation draws has the noise of the acceleration, and its rate has little else."""
+    late = Present("channel_delay", 1, {"delay_s": 2e-3, "channel": 1.0})
+
+    def worth_nm(rig: Rig) -> tuple[float, float]:
+        found = solved(ARM, runs_of(ARM, 3, 3, replace(rig, rate_hz=1000.0)))
+        raw = [contribution(late.effect, late.values, s)["motor"] for (s,) in found.dataset.signals]
+        return _rms(found, late)[MOTOR1], float(np.sqrt(np.mean(np.concatenate(raw) ** 2)))
+
+    clean, _ = worth_nm(Rig(counts=2.0**22, current_noise_a=0.0, sensor_noise_nm=0.0))
+    found, raw = worth_nm(Rig(counts=2.0**17))
+    assert found == pytest.approx(clean, rel=0.2)
+    assert raw > 5.0 * clean, "else this shows nothing"
