@@ -138,7 +138,7 @@ class Sets:
             for size in sorted({e.size for e in entries} - {1})
             for members in [np.flatnonzero([e.size == size for e in entries])]
         ]
-        self._low, self._high = _bounds(entries)
+        self.low, self.high = _bounds(entries)
         self._odds = np.array([e.odds for e in entries])
         self._fits: dict[Set, Fit] = {}
 
@@ -169,7 +169,7 @@ class Sets:
         inner = self.gram[np.ix_(at, at)] + np.eye(len(at))
         right = self.gram[at, -1]
         factor = cho_factor(inner)
-        mean = _within(inner, right, self._low[at], self._high[at])
+        mean = _within(inner, right, self.low[at], self.high[at])
         covariance = cho_solve(factor, np.eye(len(at)))
         explained = float(2.0 * mean @ right - mean @ inner @ mean)
         explained -= self.noise.by_chance(self.coefficients(chosen, mean))
@@ -196,7 +196,7 @@ class Sets:
             precision = rest[self._place, self._place] + 1.0
             b = response[self._place]
             with np.errstate(divide="ignore", invalid="ignore"):
-                best = np.clip(b / precision, self._low[self._place], self._high[self._place])
+                best = np.clip(b / precision, self.low[self._place], self.high[self._place])
                 value = best * b - 0.5 * precision * best**2 - 0.5 * np.log(precision)
             good = (precision >= 1.0) & free[self._single]
             out[self._single[good]] = value[good]

@@ -63,8 +63,8 @@ BADGES: Final = {
 }
 """Colour and text beside the headline."""
 BALANCES: Final = {
-    "motor": "motor balance (current against sensor)",
-    "torsion": "torsion (both encoders against sensor)",
+    "motor": "motor balance (current against torque)",
+    "torsion": "torsion (both encoders against torque)",
 }
 MOST_ROWS: Final = 4
 """Rows of the table; smaller entries that matter are listed below it."""

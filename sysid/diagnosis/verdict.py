@@ -256,7 +256,8 @@ class Judged:
     """Entries that are one effect, in the set: their places, rms per channel [Nm], twice the log evidence that the best set
     without them lacks, and that the set without them lacks where a discrepancy may imitate them, that best set's entries
     instead, least deviations of the coefficients [z] from none, in the set and its rivals; how much their size differs from
-    run to run, and the standard error of its mean over runs, parts of it; the values that rivals give them.
+    run to run, and the standard error of its mean over runs, parts of it; whether it is held at a bound; the values that
+    rivals give them.
     """
 
     members: tuple[int, ...]
@@ -268,6 +269,7 @@ class Judged:
     z: float
     differs: float
     error: float
+    held: bool
     elsewhere: tuple[Values, ...] = ()
 
 
@@ -302,6 +304,7 @@ def judged(solution: Solution) -> list[Judged]:
         rival = min(none, key=lambda r: lacks[r])
         at = np.concatenate([np.arange(places[k].start, places[k].stop) for k in members])
         inner = solution.covariance[np.ix_(at, at)]
+        size, own = plain.fit(chosen).mean[at], plain.columns(chosen)[at]
         z2, present = [], []
         for every in (s for s in alike if s.issuperset(members)):
             there, mean = plain.places(every), plain.fit(every).mean
@@ -319,6 +322,7 @@ def judged(solution: Solution) -> list[Judged]:
                 tuple(sets.entries[k] for k in rival - chosen),
                 math.sqrt(max(min(z2), 0.0)),
                 *sizes.over_runs(at),
+                bool(np.any((size <= plain.low[own]) | (size >= plain.high[own]))),
                 tuple(p.values for p in present[1:]),
             )
         )
@@ -360,6 +364,7 @@ def grade_of(j: Judged, *, hidden: bool) -> tuple[str, tuple[str, ...]]:
         "a discrepancy, or a recorder within its step, would look alike": j.imitated <= limits.RIVAL,
         f"it is less than {limits.SURE:g} standard deviations from none": j.z <= limits.SURE,
         size if math.isfinite(j.differs) else "one run has no other to agree with": j.error >= limits.AGREE,
+        "it is held at the end of its range": j.held,
         "more than it remains in its balance": hidden,
     }
     found = tuple(text for text, holds in doubts.items() if holds)

@@ -13,7 +13,7 @@ from scipy.stats import sem
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Friction
-from jtqd.sysid.diagnosis import verdict
+from jtqd.sysid.diagnosis import limits, verdict
 from jtqd.sysid.diagnosis.evidence import Sets
 from jtqd.sysid.diagnosis.findings import CERTAIN, EFFECTIVE, ONE_OF, Present
 from jtqd.sysid.diagnosis.model import _STATES, Solution
@@ -187,7 +187,7 @@ def test_the_interval_of_the_gain_is_over_runs(solution: Solution) -> None:
     assert "motor balance of joint 1" in apart.split
 
 
-SURE = {"delta": 40.0, "imitated": 30.0, "z": 5.0, "differs": 0.05, "error": 0.05}
+SURE = {"delta": 40.0, "imitated": 30.0, "z": 5.0, "differs": 0.05, "error": 0.05, "held": False}
 
 
 @pytest.mark.parametrize(
@@ -199,6 +199,7 @@ SURE = {"delta": 40.0, "imitated": 30.0, "z": 5.0, "differs": 0.05, "error": 0.0
         ({"imitated": 0.5}, False, False, EFFECTIVE),
         ({"z": 2.5}, False, False, EFFECTIVE),
         ({"error": 0.08}, False, False, EFFECTIVE),
+        ({"held": True}, False, False, EFFECTIVE),
         ({"delta": 0.5, "imitated": 0.5}, True, False, ONE_OF),
         ({"delta": 0.5, "imitated": 0.5}, False, False, EFFECTIVE),
     ],
@@ -321,3 +322,14 @@ def test_an_effect_of_a_rate_is_worth_nothing_of_the_noise() -> None:
     found, raw = worth_nm(Rig(counts=2.0**17))
     assert found == pytest.approx(clean, rel=0.2)
     assert raw > 5.0 * clean, "else this shows nothing"
+
+
+@pytest.mark.parametrize("part", [0.4, 0.7])
+def test_a_value_at_the_end_of_its_range_is_not_certain(part: float) -> None:
+    """A torque constant of 0.4 of the file's is another unit, not a data sheet that is off: 0.5 is the end."""
+    weak = replace(ARM, torque_constant_nm_per_a=part * ARM.torque_constant_nm_per_a)
+    found = solved(ARM, runs_of(weak, 3, 4, Rig(counts=2.0**22)))
+    [j] = [j for j in judged(found) if j.present.name == "torque_constant"]
+    assert j.held == (part < limits.SCALES[0])
+    grade, _ = grade_of(j, hidden=False)
+    assert grade == CERTAIN or part < limits.SCALES[0]
