@@ -155,8 +155,6 @@ _SAME: Final = 0.02, 1e-3
 """Gain and delay, s, of a velocity channel that do no harm."""
 _SURELY: Final = 3.0
 """Standard deviations."""
-_FINEST_HZ: Final = 80.0
-"""Averages over bins do the rest above it."""
 
 
 @dataclass(frozen=True)
@@ -332,7 +330,7 @@ class _Motion:
         lowest = np.full(len(self.whole), min(hz, self.visible.slowest_hz))
         text = f"torque_nm: {why}, known below {hz:.0f} Hz; the balances are judged below it"
         coarse = self.coarse if self.visible.slowest_hz <= hz else text
-        return replace(self, visible=Smoother.of(lowest, step_s, _FINEST_HZ), coarse=coarse)
+        return replace(self, visible=Smoother.of(lowest, step_s), coarse=coarse)
 
 
 def _motion(
@@ -374,7 +372,7 @@ def _known(
         step = float(np.median(np.diff(time)))
         per_rated = joint.rated_torque_nm / (joint.gear_ratio * joint.rotor_inertia_kgm2)
         hz = cutoff_hz(noise, step, _VISIBLE * per_rated, of_velocity=not of_position)
-        visible = Smoother.of(hz, step, _FINEST_HZ)
+        visible = Smoother.of(hz, step)
     else:
         visible = like.visible
     coarse = _cost(joint, time, x, noise, visible, of_position=of_position)

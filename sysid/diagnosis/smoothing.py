@@ -102,6 +102,8 @@ _LITTLE: Final = 0.3
 """Part of a run that may be finer than the rest without bins as short as its own."""
 _STEP: Final = 1.25
 """Cutoffs that differ by less are one."""
+_HIGHEST: Final = 0.45
+"""Part of the sampling rate."""
 
 
 def steps_of(x: FloatArray) -> FloatArray:
@@ -262,10 +264,11 @@ class Smoother:
     parts: tuple[tuple[float, BoolArray], ...] = ()
 
     @staticmethod
-    def of(hz: FloatArray, step_s: float, finest_hz: float) -> Smoother:
-        """Return the smoother of these cutoffs [n]; those above finest_hz are none."""
-        finest = min(finest_hz, 0.45 / step_s)
-        level = np.where(hz < finest, np.floor(np.log(np.minimum(hz, 1e9)) / math.log(_STEP)), np.inf)
+    def of(hz: FloatArray, step_s: float) -> Smoother:
+        """Return the smoother of these cutoffs [n]; those about the highest frequency that samples hold are none."""
+        level = np.where(
+            hz < _HIGHEST / step_s, np.floor(np.log(np.minimum(hz, 1e9)) / math.log(_STEP)), np.inf
+        )
         levels = np.unique(level[np.isfinite(level)])
         return Smoother(step_s, tuple((_STEP ** float(k), np.asarray(level == k)) for k in levels))
 

@@ -603,3 +603,13 @@ def test_rivals_of_one_entry_are_rivals_of_all(monkeypatch: pytest.MonkeyPatch) 
     for name, value in values_of(solution, third).items():
         assert value.ci95[0] <= there.values[name] <= value.ci95[1]
     assert any(abs(there.values[n] - v) > 0.0 for n, v in third.present.values.items())
+
+
+@pytest.mark.parametrize("counts", [2.0**12, 2.0**13, 2.0**14, 2.0**15])
+def test_the_noise_of_an_acceleration_names_nothing(counts: float) -> None:
+    """On one pendulum torque and angle add up to the acceleration. A set that trades the inertia for a torque constant and
+    an unbalance has none of the encoder's noise.
+    """
+    found = diagnose(runs_of(ARM, 3, 4, Rig(rate_hz=1000.0, counts=counts)), {1: ARM})
+    assert found.verdict == NO_GAP
+    assert not found.causes

@@ -132,7 +132,7 @@ def test_noise_of_an_acceleration_is_what_differences_of_noise_have_below_a_cuto
 def test_a_smoother_is_linear_has_no_delay_and_leaves_alone_what_is_fine() -> None:
     hz = np.full(4000, np.inf)
     hz[2000:] = 20.0
-    smoother = Smoother.of(hz, STEP_S, 80.0)
+    smoother = Smoother.of(hz, STEP_S)
     t = STEP_S * np.arange(4000)
     slow, quick = np.sin(2.0 * np.pi * 4.0 * t), np.sin(2.0 * np.pi * 70.0 * t)
     assert smoother(slow + quick) == pytest.approx(smoother(slow) + smoother(quick))
@@ -141,4 +141,4 @@ def test_a_smoother_is_linear_has_no_delay_and_leaves_alone_what_is_fine() -> No
     assert smoother(slow)[2200:3800] == pytest.approx(slow[2200:3800], abs=0.01)
     both = np.array([slow, quick])
     assert np.array_equal(smoother(both), [smoother(row) for row in both])
-    assert Smoother.of(np.full(4000, 90.0), STEP_S, 80.0).parts == ()
+    assert Smoother.of(np.full(4000, 0.46 / STEP_S), STEP_S).parts == ()
