@@ -293,30 +293,40 @@ class Sets:
         ]
 
 
-def without_noise(gram: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return normal equations over [columns, response] without what noise puts into them, of all but the response's square,
-    and what was taken out.
+def without_noise(grams: FloatArray, noises: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return normal equations of recordings [r] over [columns, response] without what noise puts into them, of all but the
+    response's square, and what was taken out.
 
-    A direction of the columns that is noise for the most part is none: there a coefficient would explain noise. Directions
-    are those in which neither energy nor noise is correlated, so it does not matter which columns span them.
+    A direction of the columns that is noise for the most part in all recordings together is none: there a coefficient would
+    explain noise. Directions are those in which neither energy nor noise is correlated, so it does not matter which columns
+    span them.
     """
-    energy = np.diag(gram)[:-1]
+    gram, noise = grams.sum(axis=0)[:-1, :-1], noises.sum(axis=0)[:-1, :-1]
+    _, kept = _directions(gram, noise)
+    into = kept @ (kept.T @ gram)  # columns less what of them is noise
+    clean, taken = grams.copy(), noises.copy()
+    for g, n, one, other in zip(grams, noises, clean, taken, strict=True):
+        here, there = into.T @ g[:-1, :-1] @ into, into.T @ n[:-1, :-1] @ into
+        part, white = _directions(here, there)
+        back = here @ white
+        response = white.T @ into.T @ (g[:-1, -1] - n[:-1, -1])
+        most = float(np.sum(response**2 / (1.0 - part)))  # no direction explains more than there is
+        response *= min(1.0, math.sqrt(g[-1, -1] / most)) if most > 0.0 else 1.0
+        for each, square, last in ((one, 1.0 - part, response), (other, part, white.T @ into.T @ n[:-1, -1])):
+            each[:-1, :-1] = back * square @ back.T
+            each[:-1, -1] = each[-1, :-1] = back @ last
+    return clean, taken
+
+
+def _directions(gram: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the part of noise [k] in directions [E, k] of the columns, of unit energy, which are not noise for the most."""
+    energy = np.diag(gram)
     scale = 1.0 / np.sqrt(np.where(energy > 0.0, energy, np.inf))
-    values, vectors = np.linalg.eigh(gram[:-1, :-1] * scale[:, None] * scale)
+    values, vectors = np.linalg.eigh(gram * scale[:, None] * scale)
     seen = values > _ALIKE
     white = scale[:, None] * vectors[:, seen] / np.sqrt(values[seen])
-    part, turn = np.linalg.eigh(white.T @ noise[:-1, :-1] @ white)
-    white = white @ turn[:, part < _NOISY]
-    part = np.maximum(part[part < _NOISY], 0.0)
-    back = gram[:-1, :-1] @ white
-    response = white.T @ (gram[:-1, -1] - noise[:-1, -1])
-    most = float(np.sum(response**2 / (1.0 - part)))  # no direction explains more than there is
-    response *= min(1.0, math.sqrt(gram[-1, -1] / most)) if most > 0.0 else 1.0
-    clean, taken = gram.copy(), noise.copy()
-    for each, square, last in ((clean, 1.0 - part, response), (taken, part, white.T @ noise[:-1, -1])):
-        each[:-1, :-1] = back * square @ back.T
-        each[:-1, -1] = each[-1, :-1] = back @ last
-    return clean, taken
+    part, turn = np.linalg.eigh(white.T @ noise @ white)
+    return np.maximum(part[part < _NOISY], 0.0), white @ turn[:, part < _NOISY]
 
 
 class Equations:
@@ -340,8 +350,7 @@ class Equations:
         self.entries, self.groups, self.shared = list(entries), groups, shared
         self.recorded = np.zeros(sum(e.size for e in entries))
         self.start, self.most = start, most
-        parts = [without_noise(*each) for each in zip(grams, noise, strict=True)]
-        self.grams, self.noise = (np.array(x) for x in zip(*parts, strict=True))
+        self.grams, self.noise = without_noise(grams, noise)
         self.E, self.N = sum(e.size for e in entries), len(groups)
         self.kinds = sorted(set(groups), key=str)
         self.member = {g: np.array([k for k, h in enumerate(groups) if h == g], np.intp) for g in self.kinds}

@@ -91,9 +91,9 @@ _BANDS: Final = 6
 """Above it; motion and lines leave one of them."""
 _CALMEST: Final = 0.3
 """Quantile over the segments: in fewer of them a joint reverses or is pushed."""
-_OF_NOISE: Final = 0.595
+_OF_NOISE: Final = 0.587
 """This quantile of a band's energy, in white noise of unit variance."""
-_ALIKE: Final = 12.0
+_ALIKE: Final = 20.0
 """Over the root of the samples: by this part the densities of white noise in two bands may differ by chance."""
 _ORDER: Final = 3
 _SLOWEST_HZ: Final = 8.0

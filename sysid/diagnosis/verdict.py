@@ -202,9 +202,8 @@ def _grams(solution: Solution) -> tuple[list[dict[Channel, FloatArray]], list[di
             if run.name in noisy:
                 noise = _rows(noisy[run.name], c, weights, run) - x
                 extra[pieces[r]][c] += noise.T @ noise
-    clean = [
-        {c: without_noise(g, e[c])[0] for c, g in of.items()} for of, e in zip(grams, extra, strict=True)
-    ]
+    each = {c: without_noise(*(np.array([of[c] for of in x]) for x in (grams, extra)))[0] for c in channels}
+    clean = [{c: each[c][r] for c in channels} for r in range(len(grams))]
     return clean, counts
 
 

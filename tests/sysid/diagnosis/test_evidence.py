@@ -404,7 +404,9 @@ def with_noise(seed: int, columns: int = 6) -> tuple[FloatArray, FloatArray]:
 def test_equations_without_noise_are_those_of_measurements(seed: int) -> None:
     """Whatever is taken out: no square is negative, none explains more than there is, and the response keeps its own."""
     gram, noise = with_noise(seed)
-    clean, _ = without_noise(gram, (1.0 + seed % 3) * noise)  # known to its scatter, or not at all
+    (clean,), _ = without_noise(
+        gram[None], (1.0 + seed % 3) * noise[None]
+    )  # known to its scatter, or not at all
     assert np.linalg.eigvalsh(clean)[0] > -1e-9 * np.trace(gram)
     assert np.linalg.eigvalsh((gram - clean)[:-1, :-1])[0] > -1e-9 * np.trace(gram)
     assert clean[-1, -1] == gram[-1, -1]
@@ -414,9 +416,8 @@ def test_it_does_not_matter_which_columns_span_the_equations_without_noise() -> 
     gram, noise = with_noise(3)
     turn = np.eye(7)
     turn[:6, :6] = np.random.default_rng(4).normal(size=(6, 6))
-    for other, one in zip(
-        without_noise(turn.T @ gram @ turn, turn.T @ noise @ turn), without_noise(gram, noise), strict=True
-    ):
+    turned = without_noise((turn.T @ gram @ turn)[None], (turn.T @ noise @ turn)[None])
+    for (other,), (one,) in zip(turned, without_noise(gram[None], noise[None]), strict=True):
         assert other == pytest.approx(turn.T @ one @ turn, rel=1e-6, abs=1e-6 * gram.max())
 
 
@@ -424,7 +425,7 @@ def test_a_direction_that_is_mostly_noise_is_none() -> None:
     """Two columns that differ by noise alone are one, although neither is noise for the most part."""
     gram = 100.0 * np.array([[1.0, 0.9, 0.5], [0.9, 1.0, 0.4], [0.5, 0.4, 1.0]])
     noise = np.diag([8.0, 8.0, 0.0])  # of their difference 16, of which there is 20
-    clean, taken = without_noise(gram, noise)
+    (clean,), (taken,) = without_noise(gram[None], noise[None])
     one, other = np.array([1.0, -1.0]), np.array([1.0, 1.0])
     assert clean[:2, :2] @ one == pytest.approx(0.0, abs=1e-9)
     assert clean[:2, -1] @ one == pytest.approx(0.0, abs=1e-9)

@@ -613,3 +613,16 @@ def test_the_noise_of_an_acceleration_names_nothing(counts: float) -> None:
     found = diagnose(runs_of(ARM, 3, 4, Rig(rate_hz=1000.0, counts=counts)), {1: ARM})
     assert found.verdict == NO_GAP
     assert not found.causes
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_noise_of_a_torque_in_a_regressor_chooses_no_other_set(seed: int) -> None:
+    """Beside a noisy sensor: torque constant and frictions off. An inertia and an unbalance in the place of the torque
+    constant make the same torque, free of the sensor's noise.
+    """
+    friction = Friction(0.6 * ARM.friction.coulomb_nm, 1.6 * ARM.friction.viscous_nms_per_rad)
+    true = replace(ARM, torque_constant_nm_per_a=0.85 * ARM.torque_constant_nm_per_a, friction=friction)
+    rig = Rig(rate_hz=100.0, seconds=25.0, sensor_noise_nm=0.6, moment_nm=20.0, inertia_kgm2=2.0)
+    found = diagnose(runs_of(true, seed, 4, rig), {1: ARM})
+    assert {c.name for c in found.causes} == {"torque_constant", "coulomb_friction", "viscous_friction"}
+    assert all(c.grade == CERTAIN for c in found.causes)
