@@ -238,7 +238,7 @@ def set_state(s: JointSignals, present: Sequence[Present]) -> None:
     s.believed[:] = [with_effects_applied(replace(s.joint, effects=values))]
     _set_torsion(s, mine)
     reads = [p for p in mine if "current_a" in p.effect.hooks]  # more or later than what drives the motor
-    more_a, mine = _sum(s, reads, MOTOR) / s.nm_per_a, [p for p in mine if p not in reads]
+    mine = [p for p in mine if p not in reads]
     acting = [p for p in mine if "current_a" in fields_used(p.effect, p.values, s.joint)]
     rest = s.demand_nm + _sum(s, [p for p in mine if p not in acting], MOTOR)
     s.state.current_a = rest / s.nm_per_a
@@ -254,6 +254,8 @@ def set_state(s: JointSignals, present: Sequence[Present]) -> None:
         s.state.current_a = np.clip(before - lack / np.clip(slope, *_SLOPES), -most, most)
         if float(np.max(np.abs(lack))) < _NO_STEP * most:
             break
+    s.state.current_rate_a_s = first_difference(s.state.current_a, s.time_s)
+    more_a = _sum(s, reads, MOTOR) / s.nm_per_a
     s.state.current_rate_a_s = first_difference(s.state.current_a + more_a, s.time_s)  # of the reading
 
 
