@@ -20,9 +20,11 @@ SOURCE = """
 cdef double LIMIT = 4.0
 
 cdef int clipped(double x, int *count) noexcept nogil:
+    cdef int k
     if not (-LIMIT <= x < LIMIT and count[0] >= 0):
         return -1
-    count[0] += 2
+    for k in range(2, 0, -1):
+        count[0] += 1
     return 10 if x > 1.5 else 20
 
 def both(double x):

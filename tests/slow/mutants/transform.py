@@ -121,6 +121,8 @@ class Mutator:
                 continue
             if isinstance(child, list):
                 made: Any = [self.top(each) if self.at_top(node) else self.walk(each) for each in child]
+                if attribute == "args" and is_range(node):  # a loop whose step is no constant is no loop in C
+                    made[2:] = child[2:]
             elif isinstance(node, ExprNodes.IndexNode) and isinstance(child, ExprNodes.IntNode):
                 other = integer(int(child.value, 0) ^ 1, child.pos)
                 made = self.either(child, child, f"[{child.value}] -> [{other.value}]", other)
@@ -215,6 +217,12 @@ def clone(node: Any) -> Any:
 def holds_scope(node: Any) -> bool:
     """Return whether a comprehension is in a node: it refers to itself, and cannot be cloned."""
     return any(isinstance(each, (ExprNodes.ScopedExprNode, ExprNodes.LambdaNode)) for each in every(node))
+
+
+def is_range(node: Any) -> bool:
+    """Return whether a node is a call of range."""
+    function = getattr(node, "function", None)
+    return isinstance(function, ExprNodes.NameNode) and function.name == "range"
 
 
 def targets(node: Any) -> set[str]:
