@@ -770,14 +770,13 @@ def as_booted(config: Config, nodes: Mapping[str, Mapping[str, Any]]) -> Config:
     return replace(config, joints=tuple(of(joint) for joint in config.joints))
 
 
-def load_config(path: Path | None, role: str | None = None) -> Config:
+def load_config(path: Path | str | None, role: str | None = None) -> Config:
     """Read and check a configuration; None is the shipped bench configuration. role: in place of the file's.
 
     Raises:
         ConfigError: one line naming file, key, what was found and what was expected.
     """
-    if path is None:
-        path = shipped(DEFAULT_CONFIG)
+    path = shipped(DEFAULT_CONFIG) if path is None else Path(path)
     mapping, data = read_yaml(path)
     with in_file(str(path)):
         _check_one_sensor(mapping)

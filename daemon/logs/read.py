@@ -38,7 +38,7 @@ class Messages(NamedTuple):
     records: Records
 
 
-Logs = Path | Sequence[Path]
+Logs = Path | str | Sequence[Path | str]
 """A log, a directory with the parts of one run, or the parts themselves."""
 
 
@@ -65,8 +65,7 @@ def read_topics(
         LogError: no message on a topic in that time, a damaged file, or one whose messages cannot be decoded.
         OSError: a file cannot be read.
     """
-    found = read_messages(path, topics, start_ns=start_ns, end_ns=end_ns)
-    return {topic: messages.records for topic, messages in found.items()}
+    return {t: m.records for t, m in read_messages(path, topics, start_ns=start_ns, end_ns=end_ns).items()}
 
 
 def read_messages(
@@ -80,7 +79,8 @@ def read_messages(
     span = "" if start_ns is None and end_ns is None else " in that time"
     for topic, table in tables.items():
         if not table.count:
-            raise LogError(f"{parts[0]}: found no message on {topic}{span}, expected one per cycle")
+            there = ", ".join(sorted(topics_of(parts)))
+            raise LogError(f"{parts[0]}: found no message on {topic}{span}, expected one of {there}")
     return {topic: table.messages() for topic, table in tables.items()}
 
 
@@ -210,11 +210,11 @@ def log_parts(path: Logs) -> list[Path]:
     A directory may hold one run of jtqd, or any MCAP files that follow one another. Raises LogError for one with several
     runs, or none; OSError.
     """
-    if not isinstance(path, Path):
+    if not isinstance(path, Path | str):
         if not path:
             raise LogError("found no log, expected at least one")
-        return _in_order(path)
-    if not path.is_dir():
+        return _in_order([Path(each) for each in path])
+    if not (path := Path(path)).is_dir():
         return [path]
     files = sorted(each for each in path.iterdir() if each.name.endswith(_ENDINGS) and each.is_file())
     if not files:

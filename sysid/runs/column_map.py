@@ -337,10 +337,10 @@ class ColumnMap:
         return cls(columns, files, every, drives, where, loads)
 
     @classmethod
-    def load(cls, path: Path) -> ColumnMap:
+    def load(cls, path: Path | str) -> ColumnMap:
         """Read a column map file. Raises ConfigError."""
-        mapping = load_yaml(path)
-        return cls.from_mapping(mapping, str(path), path.parent)
+        mapping = load_yaml(Path(path))
+        return cls.from_mapping(mapping, str(path), Path(path).parent)
 
     @property
     def known_loads(self) -> tuple[int, ...]:

@@ -45,12 +45,12 @@ def ends_in(path: Path, endings: tuple[str, ...]) -> bool:
     return path.name.lower().endswith(endings)
 
 
-def run_paths(arguments: Sequence[Path]) -> list[Path]:
+def run_paths(arguments: Sequence[Path | str] | Path | str) -> list[Path]:
     """Return the run files: a file is itself; a directory stands for its tables, or its logs where it has no table. Raises
     RunError.
     """
     paths: list[Path] = []
-    for argument in arguments:
+    for argument in map(Path, [arguments] if isinstance(arguments, Path | str) else arguments):
         if not argument.is_dir():
             if not argument.exists():
                 raise RunError(f"{argument}: found no such file or directory, expected a run or a directory")
@@ -67,8 +67,8 @@ def run_paths(arguments: Sequence[Path]) -> list[Path]:
 
 
 def read_runs(
-    arguments: Sequence[Path],
-    columns: ColumnMap | Path | None = None,
+    arguments: Sequence[Path | str] | Path | str,
+    columns: ColumnMap | Path | str | None = None,
     *,
     segments: bool = False,
     joints: Sequence[int] | None = None,
@@ -82,7 +82,7 @@ def read_runs(
 
     Raises RunError, also for one run given twice (the same data, or a log and its table); ConfigError for the column map.
     """
-    mapping = ColumnMap.load(columns) if isinstance(columns, Path) else columns
+    mapping = ColumnMap.load(columns) if isinstance(columns, Path | str) else columns
     runs: list[RunFile] = []
     said: set[str] = set()
     known: list[tuple[str, Windows]] = []

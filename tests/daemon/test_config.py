@@ -53,6 +53,11 @@ def test_the_shipped_configuration_is_read() -> None:
     assert all(joint.network is None and joint.temperature for joint in config.joints)
 
 
+def test_a_path_may_be_text() -> None:
+    path = shipped("bench.yaml")
+    assert load_config(str(path)) == load_config(path)
+
+
 def test_what_is_left_out_has_its_default(tmp_path: Path) -> None:
     """Old configurations say less: two joints are enough, and the times follow from the period and the heartbeat."""
 

@@ -90,6 +90,17 @@ def test_every_field_is_what_the_library_decodes(log, topic):
     assert all(same(*pair) for pair in zip(found.records, [message for _, message in expected], strict=True))
 
 
+def test_a_path_may_be_text_and_a_topic_that_is_missing_names_those_that_are_there():
+    log = GOLDEN / "network.mcap"
+    for path in (str(log), [str(log)]):
+        assert read_topic(path, "/joint/1/state").tobytes() == read_topic(log, "/joint/1/state").tobytes()
+    assert topics_of(str(log)) == topics_of(log)
+    assert read_attachments(str(log)) == read_attachments(log)
+    words = "no message on /joint/3/state, expected one of /can/frames, /diagnostics"
+    with pytest.raises(LogError, match=words):
+        read_topic(str(log), "/joint/3/state")
+
+
 def test_fixed_messages_are_never_decoded_one_by_one(log, monkeypatch):
     def refuse(*_):
         raise AssertionError("decoded one by one")

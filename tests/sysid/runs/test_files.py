@@ -508,6 +508,16 @@ def test_numbers_a_text_could_get_wrong_survive(tmp_path):
     assert np.all(np.abs(found - values) <= 1e-9 + 1e-15 * np.abs(values))
 
 
+def test_paths_may_be_text(tmp_path):
+    (tmp_path / "a.csv").write_text("t,i\n0.000,1.5\n0.001,1.6\n0.002,1.6\n")
+    (tmp_path / "columns.yaml").write_text("time_s: t\nj1.current_a: i\n")
+    columns = str(tmp_path / "columns.yaml")
+    for where in (str(tmp_path), [str(tmp_path)], tmp_path):
+        [run] = read_runs(where, columns)
+        assert (run.path, run.table.joints[1].current_a.tolist()) == (tmp_path / "a.csv", [1.5, 1.6, 1.6])
+    assert ColumnMap.load(columns) == ColumnMap.load(Path(columns))
+
+
 def test_a_directory_is_its_tables_and_names_are_unique(tmp_path):
     """A campaign's directory holds the log of every run beside its table: read once, not twice."""
     one, other = tmp_path / "one", tmp_path / "other"
