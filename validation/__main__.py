@@ -24,6 +24,10 @@ STUDIES: Final = {
         "validation.current_path.study",
         "a network of the current path: one encoder on four plants",
     ),
+    "changed": (
+        "validation.current_path.changed",
+        "one thing changed after the fit: with a network, and without",
+    ),
     "payloads": (
         "validation.goals.payloads",
         "fitted from two known payloads, without a torque sensor, against fitted with one",

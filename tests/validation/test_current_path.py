@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +13,14 @@ import pytest
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns
+from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, expand
 from jtqd.sysid.train.current_path import EVERY, Block, Recipe, block, estimate_nm, seen, train
 from jtqd.sysid.train.network import network_output
 from tests.estimator.fused_helpers import fused_joint
+from validation.current_path import changed
 from validation.current_path.study import Example, Served, load_step_runs, percent, share
+from validation.goals.identify import Change
 
 JOINT: Joint = fused_joint()
 INPUTS, N = 28, 1500
@@ -141,3 +146,17 @@ def test_load_steps_are_steep_and_within_limits() -> None:
 def test_figures_in_service_are_errors_and_what_intervals_hold() -> None:
     sums = Served(np.array([4.0, 16.0]), np.array([4.0, 1.0, 200.0, 0.0, 50.0]), np.array([180.0, 0.0, 1.0]))
     assert sums.text(40.0) == "2.50; 10.00 | 90.0; 0.0 | 2.0"
+
+
+def test_what_is_flagged_is_not_beyond_and_rest_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What settles and rests errs by 9 Nm; of 400 samples that move half err by 4 sigma, and half of these are degraded."""
+    status = np.full(1000, VALID, np.uint8)
+    status[100:600], status[600:700] = STANDSTILL, DEGRADED
+    error = np.where(np.arange(1000) < 600, 9.0, np.where(np.arange(1000) < 800, 2.0, 0.0))
+    found = SimpleNamespace(torque_nm=5.0 + error, sigma_nm=np.full(1000, 0.5), status=status)
+    monkeypatch.setattr(changed, "estimate_columns", lambda *_: found)
+    table = SimpleNamespace(time_s=1e-3 * np.arange(1000))
+    run: Any = SimpleNamespace(table=table, true_nm=np.full((1000, 2), 5.0), columns=lambda *_: None)
+    models: Any = [SimpleNamespace(number=number, joint=None) for number in (1, 2)]
+    got = changed.cell_of([run], Change("none"), models, (None, None))
+    assert got == (pytest.approx(np.sqrt(2.0)), 50.0, 25.0, 25.0, 0.5)
