@@ -45,7 +45,7 @@ WAIT_US, DEADLINE_US = 10_000, 18_000
 """Under valgrind a cycle takes some milliseconds, and what answers SYNC waits for a busy machine."""
 LEAST_TORQUES = 0.87
 """Of the slots, of which the start takes a tenth: a cycle without a torque costs about half as much."""
-TRIES = 3
+TRIES = 6
 """A machine that stops what answers SYNC for long is asked again."""
 
 
