@@ -295,7 +295,7 @@ def solve(total: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, FloatA
     gram = total[at[:, None], at]
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(gram), 1e-30))
     scaled = gram * scale[:, None] * scale + 1e-10 * np.eye(len(at))
-    covariance = np.linalg.inv(scaled) * scale[:, None] * scale
+    covariance = np.linalg.pinv(scaled, hermitian=True) * scale[:, None] * scale
     return covariance @ total[at, -1], covariance
 
 

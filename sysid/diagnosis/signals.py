@@ -26,6 +26,9 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sim_can.plant import TORQUE_STEPS, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
 from jtqd.sysid.diagnosis.smoothing import (
+    FIRST,
+    REACH,
+    SECOND,
     Smoother,
     acceleration_noise,
     below,
@@ -216,12 +219,11 @@ class JointSignals:
 
     def known(self, balance: str) -> BoolArray:
         """Return the samples at which a balance is known, if the channels are right [n]: the motor's where friction has a
-        direction; none within the reach of a filter from the ends.
+        direction; none within the reach of a difference or a filter from the ends.
         """
         out = self.moving.copy() if balance == MOTOR else np.ones(len(self.time_s), bool)
-        if self.visible.parts:
-            wide = max(1, round(_REMEMBERED / self.visible.slowest_hz / self.visible.step_s))
-            out[:wide] = out[-wide:] = False
+        wide = max(REACH, round(_REMEMBERED / self.visible.slowest_hz / self.visible.step_s))
+        out[:wide] = out[-wide:] = False
         return out
 
     def state_of(self, effect: Effect, p: Values) -> State:
@@ -264,8 +266,9 @@ class JointSignals:
         """
         turn = np.maximum(np.abs(rate_rad_s) * self.step_s, 1e-3)
         if self.of_position:
-            return np.asarray((30.0 - 32.0 * np.cos(turn) + 2.0 * np.cos(2.0 * turn)) / (12.0 * turn * turn))
-        return np.asarray(np.sin(turn) / turn)
+            waves = sum(2.0 * weight * np.cos(k * turn) for k, weight in enumerate(SECOND[1:], 1))
+            return np.asarray(-(SECOND[0] + waves) / (turn * turn))
+        return np.asarray(sum(2.0 * weight * np.sin(k * turn) for k, weight in enumerate(FIRST, 1)) / turn)
 
 
 _RATES: Final = ("current_rate_a_s", "link_velocity_rad_s", "torque_rate_nm_s")
@@ -366,7 +369,7 @@ def _known(
     time: FloatArray, x: FloatArray, joint: Joint, like: JointSignals | None, *, of_position: bool
 ) -> _Motion:
     """Return the motion by one channel."""
-    whole = second_difference(x, time) if of_position else np.gradient(x, time)
+    whole = second_difference(x, time) if of_position else first_difference(x, time)
     noise = noise_of(x)
     if like is None:
         step = float(np.median(np.diff(time)))

@@ -47,14 +47,16 @@ def mean_ahead(time_s: FloatArray, x: FloatArray, span_s: float) -> FloatArray:
 
 
 def second_difference(x: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the second derivative [n]: fourth order on even steps, so that a ripple of 80 Hz at 1 kHz keeps its size
-    (two central differences would take 8 % of it); plain differences where steps are uneven; ends held.
+    """Return the second derivative [n]: eighth order on even steps, so that a wave of a sixth of the sampling rate keeps its
+    size to 0.1 % (fourth order would take 1.3 % of it); plain differences where steps are uneven; ends held.
     """
     step = _even_step(time)
     if step is None:
         return np.asarray(np.gradient(np.gradient(x, time), time))
-    inner = (16.0 * (x[3:-1] + x[1:-3]) - x[4:] - x[:-4] - 30.0 * x[2:-2]) / (12.0 * step * step)
-    return np.pad(inner, 2, mode="edge")
+    inner = SECOND[0] * x[REACH:-REACH]
+    for k, weight in enumerate(SECOND[1:], 1):
+        inner = inner + weight * (x[REACH + k : len(x) - REACH + k] + x[REACH - k : len(x) - REACH - k])
+    return np.pad(inner / (step * step), REACH, mode="edge")
 
 
 def first_difference(x: FloatArray, time: FloatArray) -> FloatArray:
@@ -62,17 +64,25 @@ def first_difference(x: FloatArray, time: FloatArray) -> FloatArray:
     step = _even_step(time)
     if step is None:
         return np.asarray(np.gradient(x, time))
-    inner = (8.0 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12.0 * step)
-    return np.pad(inner, 2, mode="edge")
+    inner = np.zeros(len(x) - 2 * REACH)
+    for k, weight in enumerate(FIRST, 1):
+        inner += weight * (x[REACH + k : len(x) - REACH + k] - x[REACH - k : len(x) - REACH - k])
+    return np.pad(inner / step, REACH, mode="edge")
 
 
 def _even_step(time: FloatArray) -> float | None:
-    """Return the step of these times, None where they are uneven or too few for a difference of fourth order."""
+    """Return the step of these times, None where they are uneven or too few for a difference of eighth order."""
     steps = np.diff(time)
     step = float(np.median(steps))
-    return step if len(time) >= 5 and float(np.max(np.abs(steps - step))) <= 0.05 * step else None
+    return step if len(time) > 2 * REACH and float(np.max(np.abs(steps - step))) <= 0.05 * step else None
 
 
+FIRST: Final = 4 / 5, -1 / 5, 4 / 105, -1 / 280
+"""Weights of the eighth order by distance, from one step on: of differences."""
+SECOND: Final = -205 / 72, 8 / 5, -1 / 5, 8 / 315, -1 / 560
+"""The same from none on: of sums."""
+REACH: Final = 4
+"""Samples that they reach to both sides."""
 _FEWEST: Final = 200
 """Samples from which steps of a binade are estimated; with fewer it has those of the next."""
 _SAME: Final = 1e-8
