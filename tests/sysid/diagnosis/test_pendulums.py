@@ -640,3 +640,65 @@ def test_the_noise_of_a_torque_in_a_regressor_chooses_no_other_set(seed: int) ->
     found = diagnose(runs_of(true, seed, 4, rig), {1: ARM})
     assert {c.name for c in found.causes} == {"torque_constant", "coulomb_friction", "viscous_friction"}
     assert all(c.grade == CERTAIN for c in found.causes)
+
+
+def drawn(rng: np.random.Generator, *, two_encoders: bool, wrong: bool) -> tuple[Joint, Joint, Runs]:
+    """A joint file, the joint, its runs: sizes, rates, encoders, noise over decades; values off by what data sheets are."""
+
+    def of(*values: float) -> float:
+        return float(rng.choice(values))
+
+    rated, ratio = of(10.0, 30.0, 60.0, 150.0), of(50.0, 80.0, 101.0, 120.0, 160.0)
+    constant = rated / (ratio * rng.uniform(3.0, 12.0))
+    file = Joint(
+        name="drawn",
+        gear_ratio=ratio,
+        torque_constant_nm_per_a=constant,
+        rotor_inertia_kgm2=rated * rng.uniform(0.003, 0.03) / ratio**2,
+        stiffness_nm_per_rad=rated * rng.uniform(80.0, 400.0),
+        damping_nms_per_rad=rated * rng.uniform(0.05, 0.3) if two_encoders else 0.0,
+        link_inertia_kgm2=0.0,
+        rated_torque_nm=rated,
+        friction=Friction(rated * rng.uniform(0.02, 0.1), rated * rng.uniform(0.02, 0.15)),
+    )
+    rig = Rig(
+        moment_nm=rated * rng.uniform(0.15, 0.6),
+        inertia_kgm2=rated * rng.uniform(0.01, 0.06),
+        rate_hz=of(250.0, 500.0, 1000.0) if two_encoders else of(100.0, 200.0, 250.0, 500.0, 1000.0, 2000.0),
+        seconds=rng.uniform(8.0, 20.0),
+        sensor_noise_nm=rated * of(1e-4, 1e-3, 3e-3, 1e-2),
+        current_noise_a=rated / (ratio * constant) * of(1e-4, 1e-3, 1e-2),
+        counts=2.0 ** rng.integers(12, 22),
+    )
+    friction = file.friction
+    true = replace(
+        file,
+        torque_constant_nm_per_a=constant * of(0.85, 1.15),
+        stiffness_nm_per_rad=file.stiffness_nm_per_rad * (of(0.75, 1.3) if two_encoders else 1.0),
+        friction=Friction(friction.coulomb_nm * of(0.6, 1.6), friction.viscous_nms_per_rad * of(0.6, 1.6)),
+    )
+    true = true if wrong else file
+    made = sprung_runs if two_encoders else runs_of
+    return file, true, made(true, int(rng.integers(10**6)), int(rng.integers(3, 7)), rig)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("two_encoders", [False, True])
+@pytest.mark.parametrize("wrong", [False, True])
+def test_no_noise_and_no_rate_makes_a_wrong_entry_certain(two_encoders: bool, wrong: bool) -> None:
+    """Of 40 joints, one may have it: what is certain and matters is off, and its interval holds the true value."""
+    off = []
+    for k in range(40):
+        file, true, runs = drawn(np.random.default_rng([79, k]), two_encoders=two_encoders, wrong=wrong)
+        found = diagnose(runs, {1: file})
+        values = {
+            "torque_constant": true.torque_constant_nm_per_a,
+            "coulomb_friction": true.friction.coulomb_nm,
+            "viscous_friction": true.friction.viscous_nms_per_rad,
+        } | ({"nonlinear_stiffness": true.stiffness_nm_per_rad} if two_encoders else {})
+        assert wrong or found.verdict == NO_GAP, k
+        for c in (c for c in found.causes if c.grade == CERTAIN and c.matters):
+            low, high = next(iter(c.parameters.values())).ci95
+            if not low <= values.get(c.name, math.inf) <= high:
+                off.append(f"{k}: {c.name}")
+    assert len({text.split(":")[0] for text in off}) <= 1, off
