@@ -22,7 +22,7 @@ from jtqd.estimator.arrays import BoolArray, FloatArray
 def below(x: FloatArray, step_s: float, hz: float) -> FloatArray:
     """Return x [.., n] without what is quicker than hz, without delay."""
     reach = min(x.shape[-1] - 1, max(12, round(1.0 / (hz * step_s))))
-    sections, state = _low_pass(min(hz * step_s, 0.45))
+    sections, state = _low_pass(min(hz * step_s, _HIGHEST))
     state = state.reshape(len(state), *[1] * (x.ndim - 1), 2)
     # odd extension at both ends, forward and backward: `signal.sosfiltfilt` with the initial state of its steps kept
     ends = 2.0 * x[..., :1] - x[..., reach:0:-1], 2.0 * x[..., -1:] - x[..., -2 : -reach - 2 : -1]
@@ -113,7 +113,7 @@ _LITTLE: Final = 0.3
 _STEP: Final = 1.25
 """Cutoffs that differ by less are one."""
 _HIGHEST: Final = 0.45
-"""Part of the sampling rate."""
+"""Part of the sampling rate up to which there are cutoffs."""
 
 
 def steps_of(x: FloatArray) -> FloatArray:
