@@ -25,9 +25,10 @@ from jtqd.daemon.cli.checks import (
     check_stolen_time,
     report,
 )
-from jtqd.daemon.cli.running import Daemon, find_daemons, on_bus
+from jtqd.daemon.cli.running import find_daemons, on_bus
 from jtqd.daemon.cli.traffic import Traffic, drive, leave, listen, silent
 from jtqd.daemon.config import MASTER, Config, as_booted, load_config
+from jtqd.daemon.live.reading import Daemon
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.conditions import read_conditions

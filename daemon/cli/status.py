@@ -22,29 +22,20 @@ from rich.segment import Segment, Segments
 from rich.table import Table
 from rich.text import Text
 
-from jtqd.daemon.cli.running import (
-    RUNNING,
-    Daemon,
-    NoDaemonError,
-    Reading,
-    Watch,
-    choose_daemon,
-    find_daemons,
-    on_bus,
-)
+from jtqd.daemon.cli.running import NoDaemonError, choose_daemon, find_daemons, on_bus
+from jtqd.daemon.live.reading import RUNNING, Daemon, Reading, Watch, content
 from jtqd.daemon.shared.conditions import SEVERITIES
 from jtqd.daemon.shared.counters import Shown, shown_in
 from jtqd.daemon.shared.events import ERROR, WARNING
-from jtqd.daemon.shared.reasons import contact_line, contact_of, drive_state, joint_reason, silent_s
+from jtqd.daemon.shared.reasons import contact_line, contact_of, silent_s
 from jtqd.daemon.shared.runtime_dir import About
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, WORK_BIN_NS, SnapshotReader, View
-from jtqd.daemon.supervisor.display import COLOURS, PrintableView, bus_load, first_that_fits, plain_line
+from jtqd.daemon.supervisor.display import COLOURS, PrintableView, first_that_fits, plain_line
 from jtqd.drivers import nmt
 from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.status import NAMES, PUBLISHED
-from jtqd.estimator.text import NOTHING, counted, duration, finite, number, percent, size
+from jtqd.estimator.text import NOTHING, counted, duration, number, percent, size
 
-SCHEMA: Final = "jtq.status/1"
 _EXAMPLES: Final = """examples:
   jtq status                     live view of the daemon on this machine; Ctrl-C ends the view
   jtq status --bus can0          of the daemon on can0
@@ -247,131 +238,11 @@ class Recent:
         return (grown[-1] + 1) * bin_us if grown else None
 
 
-# ---- content ----
-
-
-def _ago_s(now_ns: int, then_ns: int) -> float | None:
-    """Return the age of a stamp; None for one that has never been set."""
-    return (now_ns - then_ns) * 1e-9 if then_ns else None
+# ---- view ----
 
 
 def _ago(now_ns: int, then_ns: int) -> str:
     return duration((now_ns - then_ns) * 1e-9)
-
-
-def content(reading: Reading) -> dict[str, Any]:
-    """Return the state as plain data, as `--json` prints it; null for unknown numbers."""
-    about, view = reading.daemon.about, reading.view
-    result: dict[str, Any] = {
-        "schema": SCHEMA,
-        "bus": about.bus,
-        "instance": about.instance,
-        "pid": about.pid,
-        "state": reading.state,
-        "why": reading.why or None,
-        "started": about.started,
-        "configuration": {"path": about.configuration, "sha256": about.configuration_sha256},
-        "method": about.method,
-        "versions": about.versions,
-    }
-    if view is None or reading.earlier is None:
-        return result
-    now_ns = time.monotonic_ns()
-    inputs = [
-        {
-            "name": name,
-            "age_s": _ago_s(view.sync_monotonic_ns, each.used_ns),
-            "after_sync_us": each.delay_ns / 1000 if each.used_ns else None,
-            "usual_us": [each.low_ns / 1000, each.high_ns / 1000] if each.low_ns <= each.high_ns else None,
-            "missed": each.missed,
-            "late": each.late,
-            "lost": each.lost,
-            "duplicates": each.duplicates,
-            "rejected": each.rejected,
-        }
-        for name, each in zip(about.inputs, view.inputs, strict=False)
-    ]
-    nodes = [
-        {
-            "node": node,
-            "what": what,
-            "state": nmt.STATES.get(view.node_states[node]) if view.node_heard_ns[node] else None,
-            "heartbeat_age_s": _ago_s(view.sync_realtime_ns, view.node_heard_ns[node]),
-            "configured": node not in view.unconfigured,
-        }
-        for node, what in sorted(about.nodes.items())
-    ]
-    notices = [
-        {
-            "realtime_ns": each.realtime_ns,
-            "level": each.level,
-            "node": each.node or None,
-            "topic": each.topic,
-            "text": each.text,
-        }
-        for each in reading.notices
-    ]
-    conditions = [
-        {
-            "name": each.name,
-            "subject": each.subject,
-            "severity": SEVERITIES[each.severity],
-            "text": each.text,
-            "for_s": (now_ns - each.since_ns) * 1e-9,
-        }
-        for each in reading.conditions
-    ]
-    load = finite(bus_load(reading.earlier, view, about.bitrate))
-    return result | {
-        "cycle": view.cycle,
-        "joints": [_joint_content(reading, view, reading.earlier, n) for n in range(len(view.joints))],
-        "inputs": inputs,
-        "work_us": dict(zip(("p50", "p99", "max"), map(finite, reading.work_us), strict=True)),
-        "late_us": dict(zip(("p50", "p99", "max"), map(finite, reading.late_us), strict=True)),
-        "bus_load": {"now": load, "worst_case": view.worst_load},
-        "bus_state": dict(reading.bus),
-        "counters": view.counters,
-        "nodes": nodes,
-        "notices": notices,
-        "conditions": conditions,
-        "recorder": reading.recorder,
-    }
-
-
-def _joint_content(reading: Reading, view: View, earlier: View, n: int) -> dict[str, Any]:
-    about, seen, measured = reading.daemon.about, view.joints[n], view.measured[n]
-    running = reading.state == RUNNING
-    known = seen.status in PUBLISHED and running
-    return {
-        "joint": n + 1,
-        "name": about.joints[n].name,
-        "status": NAMES.get(seen.status, str(seen.status)),
-        "reason": joint_reason(about, n + 1, view, earlier) or None,
-        "since_s": (view.cycle - view.status_since[n]) * view.period_s,
-        "torque_nm": finite(seen.torque_nm if known else nan),
-        "sigma_nm": finite(seen.sigma_nm if known else nan),
-        "physics_nm": finite(seen.physics_nm),
-        "network_nm": finite(seen.network_nm),
-        "sensor_nm": finite(seen.sensor_nm),
-        "reference_nm": finite(seen.reference_nm),
-        "error_nm": finite(seen.torque_nm - seen.reference_nm if known else nan),
-        "rmse_nm": finite(view.rmse_nm[n]),
-        "age_ms": finite(seen.age_ms),
-        "shadow": {name: each.content() for name, each in view.shadows[n].items()},
-        "zeros": view.zeros[n].content(),
-        "contact": contact_of(seen) if running else None,
-        "contact_nm": finite(seen.contact_nm if running else nan),
-        "contact_threshold_nm": about.joints[n].contact_threshold_nm,
-        "torque_rate_nm_s": finite(seen.torque_rate_nm_s if running else nan),
-        "current_a": finite(measured.current_a),
-        "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
-        "temperature_c": finite(measured.temperature_c),
-        "drive": drive_state(seen.statusword),
-        "cycles": {NAMES.get(code, str(code)): k for code, k in enumerate(view.status_cycles[n]) if k},
-    }
-
-
-# ---- view ----
 
 
 class StatusView:

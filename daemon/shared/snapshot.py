@@ -148,6 +148,13 @@ class View(NamedTuple):
     """Of the last frame that `cob_id_conflicts` counted."""
 
 
+def bus_load(previous: View, now: View, bitrate: int) -> float:
+    """Return the bus load between two views with worst-case stuffing; NaN without time in between."""
+    seconds = (now.sync_realtime_ns - previous.sync_realtime_ns) * 1e-9
+    bits = now.counters["bits_worst_case"] - previous.counters["bits_worst_case"]
+    return bits / seconds / bitrate if previous.sync_realtime_ns and seconds > 0 else nan
+
+
 def quantiles(bins: Sequence[int], bin_ns: int, largest_ns: int, shares: tuple[float, ...]) -> list[float]:
     """Quantiles [us] of a histogram with bins of `bin_ns`, upper edge of their bin; see `SnapshotReader.work_us`."""
     total = sum(bins)

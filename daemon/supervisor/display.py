@@ -23,7 +23,7 @@ from jtqd.daemon.shared.conditions import CATALOGUE, Occurrences
 from jtqd.daemon.shared.counters import Shown, shown_in
 from jtqd.daemon.shared.events import INFO, OperatorLog, Priority
 from jtqd.daemon.shared.reasons import contact_of, contact_text
-from jtqd.daemon.shared.snapshot import JointView, ShadowView, SnapshotReader, View
+from jtqd.daemon.shared.snapshot import JointView, ShadowView, SnapshotReader, View, bus_load
 from jtqd.estimator.status import NAMES, PUBLISHED
 from jtqd.estimator.text import counted, finite, number, percent, printable
 
@@ -43,13 +43,6 @@ _COLUMNS = {
 _DISPENSABLE = ("sensor [Nm]", "error [Nm]", "sigma [Nm]")
 _CONTACT = "contact"
 """A column, and in the line below a count, where contacts are watched."""
-
-
-def bus_load(previous: View, now: View, bitrate: int) -> float:
-    """Return the bus load between two views with worst-case stuffing; NaN without time in between."""
-    seconds = (now.sync_realtime_ns - previous.sync_realtime_ns) * 1e-9
-    bits = now.counters["bits_worst_case"] - previous.counters["bits_worst_case"]
-    return bits / seconds / bitrate if previous.sync_realtime_ns and seconds > 0 else float("nan")
 
 
 def first_that_fits(tables: Iterable[Table], console: Console, options: ConsoleOptions) -> Table | None:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from jtqd.daemon.cli.running import Daemon, Watch
 from jtqd.daemon.cli.status import StatusView
 from jtqd.daemon.config import load_config
+from jtqd.daemon.live.reading import Daemon, Watch
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.runtime_dir import About, write_about
 from jtqd.daemon.shared.snapshot import INPUT, Snapshot

@@ -26,7 +26,8 @@ from typing import NamedTuple
 import pytest
 
 from jtqd.daemon import jtq
-from jtqd.daemon.cli.running import Daemon, find_daemons
+from jtqd.daemon.cli.running import find_daemons
+from jtqd.daemon.live.reading import Daemon
 from jtqd.daemon.shared.events import ERROR
 from jtqd.models.files import shipped
 from tests.daemon.cli.status_daemon import running

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.cli.running import Watch, find_daemons, on_bus
+from jtqd.daemon.cli.running import find_daemons, on_bus
 from jtqd.daemon.config import load_config
+from jtqd.daemon.live.reading import Watch
 from jtqd.daemon.shared.events import Notices
 from jtqd.daemon.shared.faults import DRIVE_FAULT
 from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s

@@ -17,8 +17,9 @@ import pytest
 from rich.console import Console, Group
 from rich.text import Text
 
-from jtqd.daemon.cli.running import Reading, Watch, find_daemons
-from jtqd.daemon.cli.status import WINDOW_S, Recent, StatusView, content, histogram, main, paged, sparkline
+from jtqd.daemon.cli.running import find_daemons
+from jtqd.daemon.cli.status import WINDOW_S, Recent, StatusView, histogram, main, paged, sparkline
+from jtqd.daemon.live.reading import Reading, Watch, content
 from jtqd.daemon.recording.run_files import Account, ProgressFile
 from jtqd.daemon.shared.conditions import Condition, ConditionsFile
 from jtqd.daemon.shared.cycle_record import SHADOW

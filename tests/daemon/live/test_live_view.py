@@ -9,7 +9,8 @@ import time
 import pytest
 
 from jtqd.daemon.live import Address, address
-from jtqd.daemon.live.process import OLDER, PROTOCOL, LiveStream
+from jtqd.daemon.live.gateway import OLDER, PROTOCOL
+from jtqd.daemon.live.process import LiveStream
 from jtqd.daemon.recording import messages
 from jtqd.daemon.recording.messages import JOINT_ESTIMATE_SIZE, CycleMessages
 from jtqd.daemon.shared import cycle_record

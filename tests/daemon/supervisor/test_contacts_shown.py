@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from jtqd.daemon.cli.running import Daemon, Watch
-from jtqd.daemon.cli.status import Recent, StatusView, content
+from jtqd.daemon.cli.status import Recent, StatusView
 from jtqd.daemon.config import ContactSettings, load_config
+from jtqd.daemon.live.reading import Daemon, Watch, content
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.daemon.shared.snapshot import SnapshotReader
