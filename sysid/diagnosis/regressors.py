@@ -28,7 +28,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.signals import COMPUTED_HZ, SLOWEST_RAD_S, Channel, JointSignals, Line
-from jtqd.sysid.diagnosis.smoothing import below, second_difference
+from jtqd.sysid.diagnosis.smoothing import below, first_difference, second_difference
 
 BIN_S: Final = 0.005
 SAME_RATE: Final = 0.05
@@ -97,12 +97,12 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
             angle = getattr(effect, hook)(p, state, own, x)
             add(TORSION, -joint.stiffness_nm_per_rad * angle)
             if hook == "link_rad" or effect.geometric:
-                add(TORSION, -joint.damping_nms_per_rad * np.gradient(angle, s.time_s))
+                add(TORSION, -joint.damping_nms_per_rad * first_difference(angle, s.time_s))
             if hook == "link_rad" and effect.at_motor_of(p) and s.torsion_nm is not None:
                 # velocity and acceleration are of that encoder; with no other one beside it, it is not looked for
                 bent = second_difference(angle, s.time_s)
                 inertia = joint.rotor_inertia_kgm2 * joint.gear_ratio**2
-                viscous = joint.friction.viscous_nms_per_rad * np.gradient(angle, s.time_s)
+                viscous = joint.friction.viscous_nms_per_rad * first_difference(angle, s.time_s)
                 add(MOTOR, (inertia + s.per_torque * joint.link_inertia_kgm2) * bent + viscous)
                 add(TORSION, joint.link_inertia_kgm2 * bent)
             smooth = s.torsion_nm is not None and not effect.follows_torsion

@@ -479,9 +479,9 @@ def joint_signals(  # noqa: PLR0917
     if both:
         rounded = joint.stiffness_nm_per_rad * (steps_of(motion.position) / joint.gear_ratio + steps_of(link))
         twist = motion.position / joint.gear_ratio - link
-        rate = velocity - np.gradient(link, time)
         zero = _zero(twist - gear_torque / joint.stiffness_nm_per_rad, gear_torque)
-        torsion = joint.stiffness_nm_per_rad * (twist - zero) + joint.damping_nms_per_rad * rate
+        torsion = joint.stiffness_nm_per_rad * (twist - zero)
+        torsion += joint.damping_nms_per_rad * first_difference(twist, time)
         torsion -= gear_torque + link_quick
         bent = below(twist - zero, step, known) + (gear_torque - slow_torque) / joint.stiffness_nm_per_rad
         state.torsion_rate_rad_s = first_difference(bent, time)
