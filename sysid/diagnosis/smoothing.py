@@ -93,6 +93,14 @@ _ON_GRID: Final = 0.95
 """Part of the small distances between values that are whole multiples of the least, on a grid."""
 _COARSE: Final = 0.25
 """Part of a grid's step to which a distance must be known, to show it."""
+_FEW: Final = 12
+"""Steps of a grid that the least distance between values may be."""
+_OFF: Final = 0.02
+"""Part of a step by which they may be off it."""
+_OFTEN: Final = 0.8
+"""Part of the samples that differ, where values come more than once."""
+_SHOWN: Final = 8
+"""Distances that show a grid."""
 _SEGMENT: Final = 64
 """Samples of a spectrum."""
 _SLOW: Final = 0.125
@@ -120,22 +128,25 @@ def steps_of(x: FloatArray) -> FloatArray:
     """Return the steps of the values near each sample [n], in units of x; 0 where they are finer than shows: of decimals
     (fixed, or significant digits), single precision, or counts, which are the same everywhere.
     """
-    out, counts = np.zeros(len(x)), np.zeros(len(x))
+    out = np.zeros(len(x))
+    apart = [np.empty((2, 0))]
     for there in _magnitudes(x):
         values = np.unique(x[there])
-        if len(values) <= 8:  # at rest or commanded: they show no step
+        if len(values) <= _SHOWN:  # at rest or commanded: they show no step
             continue
         largest = max(float(np.max(np.abs(values))), 1e-12)
         out[there] = max(_decimal(values, largest), _single(values))
-        counts[there] = _counts(values, largest, out[there][0], again=len(values) < 0.8 * there.sum())
+        d = np.diff(values)
+        d = d[d > _SAME * largest]
+        apart.append(np.array([d, np.full(len(d), out[there][0])]))
     decade = _decades(np.abs(x))
     for e in np.unique(decade):  # few beyond a power of ten have ten times the step
         there = decade == e
         values = np.unique(x[there])
         if len(values) > 2 and 2 * len(values) > there.sum():
             out[there] = np.maximum(out[there], _decimal(values, float(np.max(np.abs(values)))))
-    usual = float(np.median(counts))
-    return np.maximum(out, np.maximum(counts, usual))
+    again = len(np.unique(x)) < _OFTEN * len(x)
+    return np.maximum(out, _counts(*np.hstack(apart), again=again))
 
 
 def described(x: FloatArray, unit: str) -> str:
@@ -221,20 +232,27 @@ def _single(values: FloatArray) -> float:
     return float(np.spacing(np.max(np.abs(short)))) if np.array_equal(short, values) else 0.0
 
 
-def _counts(values: FloatArray, largest: float, printed: float, *, again: bool) -> float:
-    """Return the step of values on a grid, 0 where they are on none or too far apart to show it; again: values came more
-    than once. Of a steady motion all distances are alike, too. A distance is known to the step that is printed.
+def _counts(apart: FloatArray, printed: FloatArray, *, again: bool) -> float:
+    """Return the step of the grid that the distances between neighbouring values of a channel [m] are multiples of, 0 where
+    there is none or too few show it; printed: step to which each is known; again: values came more than once.
+
+    A channel has one grid, so what magnitudes of few digits or steady motions leave open the others tell. The least
+    distance is a few steps; larger ones tell the step better and better. Of a steady motion all are alike, too.
     """
-    apart = np.diff(values)
-    apart = apart[apart > _SAME * largest]
-    if len(apart) < 8:
-        return 0.0
-    step = float(apart[apart < 1.5 * apart.min()].mean())
-    near = apart[apart < 20.0 * step] / step
-    off = 0.02 + printed / step
-    on = np.abs(near - np.round(near)) < off
-    grid = len(near) >= 8 and float(on.mean()) >= _ON_GRID and (again or len(np.unique(np.round(near))) > 2)
-    return step if grid and off < _COARSE else 0.0
+    order = np.argsort(apart)
+    apart, printed = apart[order], printed[order]
+    for steps in range(1, _FEW + 1):
+        step = float(np.min(apart[printed < _COARSE * apart], initial=math.inf)) / steps
+        known = np.flatnonzero(printed < _COARSE * step)
+        for k in range(1, len(known).bit_length() + 1):
+            few = apart[known[: 2**k]]
+            times = np.round(few / step)
+            step = float(times @ few) / max(float(times @ times), 1.0) or math.inf
+        times = np.round(apart[known] / step)
+        on = np.abs(apart[known] / step - times) < _OFF + printed[known] / step
+        if len(on) >= _SHOWN and (again or len(np.unique(times)) > 2) and on.mean() >= _ON_GRID:
+            return step
+    return 0.0
 
 
 def acceleration_noise(

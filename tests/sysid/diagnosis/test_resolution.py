@@ -85,6 +85,20 @@ def test_counts_that_are_printed_with_few_digits_are_a_grid() -> None:
     assert steps_of(coarse)[coarse > 10.0] == pytest.approx(1e-3), "a grid finer than what is printed is none"
 
 
+@pytest.mark.parametrize("bits", [12, 13, 14, 16])
+@pytest.mark.parametrize("count", [7, 8, 12])
+def test_the_grid_of_an_encoder_is_one_for_slow_steady_and_quick_motion(bits: int, count: int) -> None:
+    """A motor that cruises, whose neighbouring samples are always as far apart, and reverses, and is printed coarsely where
+    it is far; of each part alone not even the order of the step can be told.
+    """
+    t = np.arange(0.0, 20.0, 1.0 / 250.0)
+    speed = 50.0 * np.clip(np.sin(2.0 * np.pi * 0.08 * t) * 3.0, -0.9, 0.9)
+    step = 2.0 * np.pi / 2.0**bits
+    x = digits(np.round((120.3 + np.cumsum(speed) / 250.0) / step) * step, count)
+    printed = 10.0 ** (np.floor(np.log10(np.abs(x))) + 1.0 - count)
+    assert steps_of(x) == pytest.approx(np.maximum(step, printed), rel=1e-3)
+
+
 def test_a_steady_motion_is_no_grid() -> None:
     rng = np.random.default_rng(0)
     x = 1000.0 + 0.1 * np.arange(400) + 1e-4 * rng.normal(size=400)
