@@ -83,8 +83,6 @@ SECOND: Final = -205 / 72, 8 / 5, -1 / 5, 8 / 315, -1 / 560
 """The same from none on: of sums."""
 REACH: Final = 4
 """Samples that they reach to both sides."""
-_FEWEST: Final = 200
-"""Samples from which steps of a binade are estimated; with fewer it has those of the next."""
 _SAME: Final = 1e-8
 """Values closer than this part of the largest are one: double precision, or twelve digits of a count."""
 _DIGITS: Final = 9
@@ -97,10 +95,10 @@ _FEW: Final = 12
 """Steps of a grid that the least distance between values may be."""
 _OFF: Final = 0.02
 """Part of a step by which they may be off it."""
-_OFTEN: Final = 0.8
-"""Part of the samples that differ, where values come more than once."""
+_OFTEN: Final = 1.25
+"""Mean times of a value that comes more than once."""
 _SHOWN: Final = 8
-"""Distances that show a grid."""
+"""Values that show a step."""
 _SEGMENT: Final = 64
 """Samples of a spectrum."""
 _SLOW: Final = 0.125
@@ -128,25 +126,20 @@ def steps_of(x: FloatArray) -> FloatArray:
     """Return the steps of the values near each sample [n], in units of x; 0 where they are finer than shows: of decimals
     (fixed, or significant digits), single precision, or counts, which are the same everywhere.
     """
-    out = np.zeros(len(x))
-    apart = [np.empty((2, 0))]
-    for there in _magnitudes(x):
+    out, step = np.zeros(len(x)), 0.0
+    decade = np.floor(np.log10(np.maximum(np.abs(x), 1e-30)))
+    for there in (decade == e for e in np.unique(decade)):
         values = np.unique(x[there])
-        if len(values) <= _SHOWN:  # at rest or commanded: they show no step
-            continue
-        largest = max(float(np.max(np.abs(values))), 1e-12)
-        out[there] = max(_decimal(values, largest), _single(values))
-        d = np.diff(values)
-        d = d[d > _SAME * largest]
-        apart.append(np.array([d, np.full(len(d), out[there][0])]))
-    decade = _decades(np.abs(x))
-    for e in np.unique(decade):  # few beyond a power of ten have ten times the step
-        there = decade == e
-        values = np.unique(x[there])
-        if len(values) > 2 and 2 * len(values) > there.sum():
-            out[there] = np.maximum(out[there], _decimal(values, float(np.max(np.abs(values)))))
-    again = len(np.unique(x)) < _OFTEN * len(x)
-    return np.maximum(out, _counts(*np.hstack(apart), again=again))
+        if len(values) > min(
+            _SHOWN, max(2, there.sum() // 2)
+        ):  # at rest or commanded they show none, and have the last
+            step = _decimal(values, float(np.max(np.abs(values))))
+        out[there] = step
+    short = np.abs(x).astype(np.float32)
+    if np.array_equal(short, np.abs(x)):
+        out = np.maximum(out, np.spacing(short))
+    values, first, times = np.unique(x, return_index=True, return_counts=True)
+    return np.maximum(out, _counts(values, out[first], again=times.mean() > _OFTEN))
 
 
 def described(x: FloatArray, unit: str) -> str:
@@ -193,29 +186,6 @@ def known_below_hz(x: FloatArray, step_s: float) -> float:
     return 2.0 * float(hz[power > 2.0 * white].max(initial=0.0))
 
 
-def _magnitudes(x: FloatArray) -> list[BoolArray]:
-    """Return masks of samples between powers of 2 and of 10; one of few samples joins the next larger, the last the one
-    before.
-    """
-    size = np.abs(x)
-    order = 100.0 * np.frexp(size)[1] + _decades(size)
-    out: list[BoolArray] = []
-    waiting = np.zeros(len(x), bool)
-    for e in np.unique(order):
-        waiting |= order == e
-        if waiting.sum() >= _FEWEST:
-            out.append(waiting)
-            waiting = np.zeros(len(x), bool)
-    if waiting.any():
-        out.append(waiting if not out else out.pop() | waiting)
-    return out
-
-
-def _decades(size: FloatArray) -> FloatArray:
-    """Return the powers of ten of these sizes [n], whole numbers."""
-    return np.asarray(np.floor(np.log10(np.maximum(size, 1e-30))))
-
-
 def _decimal(values: FloatArray, largest: float) -> float:
     """Return the power of ten of which all values are multiples, 0 where they have more digits than _DIGITS."""
     place = math.floor(math.log10(largest)) - _DIGITS
@@ -226,30 +196,26 @@ def _decimal(values: FloatArray, largest: float) -> float:
     return 0.0
 
 
-def _single(values: FloatArray) -> float:
-    """Return the step of single precision where that is what they have, else 0."""
-    short = values.astype(np.float32)
-    return float(np.spacing(np.max(np.abs(short)))) if np.array_equal(short, values) else 0.0
+def _counts(values: FloatArray, printed: FloatArray, *, again: bool) -> float:
+    """Return the step of the grid on which the values of a channel [m] are, ascending, 0 where there is none or too few show
+    it; printed: step to which each is known; again: values came more than once.
 
-
-def _counts(apart: FloatArray, printed: FloatArray, *, again: bool) -> float:
-    """Return the step of the grid that the distances between neighbouring values of a channel [m] are multiples of, 0 where
-    there is none or too few show it; printed: step to which each is known; again: values came more than once.
-
-    A channel has one grid, so what magnitudes of few digits or steady motions leave open the others tell. The least
-    distance is a few steps; larger ones tell the step better and better. Of a steady motion all are alike, too.
+    A channel has one grid, so what coarse digits or steady motions leave open other values tell. The least distance is a
+    few steps; larger ones tell the step better and better. Of a steady motion all distances are alike, too.
     """
-    order = np.argsort(apart)
-    apart, printed = apart[order], printed[order]
-    for steps in range(1, _FEW + 1):
-        step = float(np.min(apart[printed < _COARSE * apart], initial=math.inf)) / steps
-        known = np.flatnonzero(printed < _COARSE * step)
+    apart, coarse = np.diff(values), np.maximum(printed[1:], printed[:-1])
+    good = np.flatnonzero(apart > _SAME * max(float(np.max(np.abs(values))), 1e-12))
+    order = good[np.argsort(apart[good])]
+    apart, coarse = apart[order], coarse[order]
+    for few in range(1, _FEW + 1):
+        step = float(np.min(apart[coarse < _COARSE * apart], initial=math.inf)) / few
+        known = np.flatnonzero(coarse < _COARSE * step)
         for k in range(1, len(known).bit_length() + 1):
-            few = apart[known[: 2**k]]
-            times = np.round(few / step)
-            step = float(times @ few) / max(float(times @ times), 1.0) or math.inf
+            least = apart[known[: 2**k]]
+            times = np.round(least / step)
+            step = float(times @ least) / max(float(times @ times), 1.0) or math.inf
         times = np.round(apart[known] / step)
-        on = np.abs(apart[known] / step - times) < _OFF + printed[known] / step
+        on = np.abs(apart[known] / step - times) < _OFF + coarse[known] / step
         if len(on) >= _SHOWN and (again or len(np.unique(times)) > 2) and on.mean() >= _ON_GRID:
             return step
     return 0.0
