@@ -30,7 +30,7 @@ class Cogging(Effect):
     )
     confused_with = {"torque_ripple": "full_turns", "kinematic_error": "full_turns"}
     experiment = "full_turns"
-    parameters = (Parameter("amplitude_nm", "Nm", 0.0, 20.0), order(5.0, None), PHASE)
+    parameters = (Parameter("amplitude_nm", "Nm", 0.0, 1000.0), order(5.0, None), PHASE)
     columns = waves("amplitude_nm", 0.1, ORDERS)
     whole_orders = range(5, 101)
     needs = ("motor_position_rad",)

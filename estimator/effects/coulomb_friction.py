@@ -22,7 +22,7 @@ class CoulombFriction(Effect):
         "temperature_dependent_friction": "warm_up",
     }
     experiment = "speed_ladder"
-    parameters = (Parameter("coulomb_nm", "Nm", 0.0, 500.0, key="friction.coulomb_nm"),)
+    parameters = (Parameter("coulomb_nm", "Nm", 0.0, 5000.0, key="friction.coulomb_nm"),)
     columns = (Column("coulomb_nm", 1.0),)
     dissipative = True
 

@@ -20,7 +20,7 @@ class CurrentOffset(Effect):
         "friction_asymmetry": "zero_reading",
     }
     experiment = "zero_reading"
-    parameters = (Parameter("offset_a", "A", -5.0, 5.0),)
+    parameters = (Parameter("offset_a", "A", -50.0, 50.0),)
     columns = (Column("offset_a", 0.01),)
 
     def current_a(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:

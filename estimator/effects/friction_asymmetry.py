@@ -22,7 +22,7 @@ class FrictionAsymmetry(Effect):
         "stribeck_friction": "slow_reversals",
     }
     experiment = "speed_ladder"
-    parameters = (Parameter("asymmetry_nm", "Nm", -100.0, 100.0),)
+    parameters = (Parameter("asymmetry_nm", "Nm", -5000.0, 5000.0),)
     columns = (Column("asymmetry_nm", 1.0),)
     dissipative = True
 

@@ -17,7 +17,7 @@ class Hysteresis(Effect):
     tell_tale = "The torsion balance changes after each reversal of the load, not of the velocity, over a fixed travel."
     confused_with = {"lost_motion": "load_ramp", "nonlinear_stiffness": "load_ramp"}
     experiment = "load_ramp"
-    parameters = (Parameter("torque_nm", "Nm", 0.0, 50.0), Parameter("travel_rad", "rad", 1e-06, 0.01))
+    parameters = (Parameter("torque_nm", "Nm", 0.0, 5000.0), Parameter("travel_rad", "rad", 1e-06, 0.01))
     columns = tuple(Column("torque_nm", 1.0, {"travel_rad": travel}) for travel in TRAVELS_RAD)
     needs = ("torsion_rad",)
     follows_torsion = True

@@ -27,7 +27,7 @@ class KinematicError(Effect):
     tell_tale = "A line of the torsion at 1, 2 or 4 cycles per motor revolution; in the motor balance only under load."
     confused_with = {"torque_ripple": "full_turns"}
     experiment = "full_turns"
-    parameters = (Parameter("amplitude_rad", "rad", 0.0, 0.005), order(), PHASE)
+    parameters = (Parameter("amplitude_rad", "rad", 0.0, 0.05), order(), PHASE)
     columns = waves("amplitude_rad", 1e-5, SHAFT_ORDERS)
     needs = ("motor_position_rad", "torque_nm")
     geometric = True

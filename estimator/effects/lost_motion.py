@@ -17,7 +17,7 @@ class LostMotion(Effect):
     tell_tale = "The torsion balance jumps by K w where the torque, not the velocity, changes its sign."
     confused_with = {"stribeck_friction": "slow_reversals", "nonlinear_stiffness": "load_ramp"}
     experiment = "load_ramp"
-    parameters = (Parameter("width_rad", "rad", 0.0, 0.02),)
+    parameters = (Parameter("width_rad", "rad", 0.0, 0.2),)
     columns = tuple(Column("width_rad", width) for width in WIDTHS_RAD)
     needs = ("torsion_rad",)
     follows_torsion = True

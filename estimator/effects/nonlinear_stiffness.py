@@ -21,13 +21,13 @@ class NonlinearStiffness(Effect):
         Parameter(
             "stiffness_nm_per_rad",
             "Nm/rad",
-            100.0,
-            10000000.0,
+            1.0,
+            1e9,
             default=math.nan,
             key="stiffness_nm_per_rad",
             prior="stiffness",
         ),
-        Parameter("cubic_nm_per_rad3", "Nm/rad3", -100000000000.0, 1000000000000.0, default=0.0),
+        Parameter("cubic_nm_per_rad3", "Nm/rad3", -1e13, 1e14, default=0.0),
     )
     scales_balance = "torsion"
     needs = ("torsion_rad",)

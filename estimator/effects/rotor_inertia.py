@@ -14,7 +14,7 @@ class RotorInertia(Effect):
     tell_tale = "The motor balance is in phase with the motor's acceleration."
     confused_with = {"viscous_friction": "speed_ladder"}
     experiment = "quick_changes"
-    parameters = (Parameter("rotor_inertia_kgm2", "kg m2", 1e-09, 1.0, key="rotor_inertia_kgm2"),)
+    parameters = (Parameter("rotor_inertia_kgm2", "kg m2", 1e-09, 1000.0, key="rotor_inertia_kgm2"),)
     columns = (Column("rotor_inertia_kgm2", 0.1, of="rotor_inertia_kgm2"),)
     needs = ("motor_acceleration_rad_s2",)
     changes_joint = True

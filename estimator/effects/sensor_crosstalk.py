@@ -19,7 +19,7 @@ class SensorCrosstalk(Effect):
         "the sensor, unbalance does not."
     }
     parameters = (
-        Parameter("amplitude_nm", "Nm", 0.0, 20.0, default=0.0),
+        Parameter("amplitude_nm", "Nm", 0.0, 1000.0, default=0.0),
         Parameter("share", "", 0.0, 0.5, default=0.0, prior="sensor_crosstalk.share"),
         PHASE,
     )

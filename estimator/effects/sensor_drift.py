@@ -32,8 +32,8 @@ class SensorDrift(Effect):
     }
     experiment = "warm_up"
     parameters = (
-        Parameter("rate_nm_per_s", "Nm/s", -1.0, 1.0, default=0.0),
-        Parameter("per_k_nm", "Nm/K", -5.0, 5.0, default=0.0, prior="sensor_drift.per_k_nm"),
+        Parameter("rate_nm_per_s", "Nm/s", -100.0, 100.0, default=0.0),
+        Parameter("per_k_nm", "Nm/K", -500.0, 500.0, default=0.0, prior="sensor_drift.per_k_nm"),
         Parameter("reference_c", "°C", -100.0, 200.0, default=FALLBACK_C, neutral=None),
     )
     needs = ("time_s",)

@@ -14,7 +14,7 @@ class SensorOffset(Effect):
     tell_tale = "A constant of all balances: both joints, motor and torsion, at rest too."
     confused_with = {"unbalance": "full_turns"}
     experiment = "zero_reading"
-    parameters = (Parameter("offset_nm", "Nm", -100.0, 100.0),)
+    parameters = (Parameter("offset_nm", "Nm", -1000.0, 1000.0),)
     columns = (Column("offset_nm", 0.1),)
     at_sensor = True
 

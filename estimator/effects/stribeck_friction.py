@@ -52,7 +52,7 @@ class StribeckFriction(Effect):
     confused_with = {"viscous_friction": "slow_reversals", "hysteresis": "slow_reversals"}
     experiment = "slow_reversals"
     parameters = (
-        Parameter("stribeck_nm", "Nm", 0.0, 200.0, key="friction.stribeck_nm"),
+        Parameter("stribeck_nm", "Nm", 0.0, 5000.0, key="friction.stribeck_nm"),
         Parameter(
             "stribeck_velocity_rad_s",
             "rad/s",

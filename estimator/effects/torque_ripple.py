@@ -27,7 +27,7 @@ class TorqueRipple(Effect):
         "the speed; none in the torsion."
     )
     experiment = "full_turns"
-    parameters = (Parameter("amplitude_nm", "Nm", 0.0, 20.0), order(), PHASE)
+    parameters = (Parameter("amplitude_nm", "Nm", 0.0, 1000.0), order(), PHASE)
     columns = waves("amplitude_nm", 0.1, SHAFT_ORDERS)
     needs = ("motor_position_rad",)
 

@@ -13,7 +13,7 @@ class Unbalance(Effect):
     source = "gravity of an eccentric mass, U = m g r"
     tell_tale = "Motor and torsion balance of one joint swing once per revolution of the link, whatever load and speed."
     experiment = "full_turns"
-    parameters = (Parameter("moment_nm", "Nm", 0.0, 100.0), PHASE)
+    parameters = (Parameter("moment_nm", "Nm", 0.0, 10000.0), PHASE)
     columns = (Column("moment_nm", 0.1),)
     needs = ("link_position_rad",)
 

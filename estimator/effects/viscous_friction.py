@@ -14,7 +14,7 @@ class ViscousFriction(Effect):
     tell_tale = "The motor balance is proportional to velocity in both directions, at any load."
     experiment = "speed_ladder"
     parameters = (
-        Parameter("viscous_nms_per_rad", "Nms/rad", 0.0, 500.0, key="friction.viscous_nms_per_rad"),
+        Parameter("viscous_nms_per_rad", "Nms/rad", 0.0, 50000.0, key="friction.viscous_nms_per_rad"),
     )
     columns = (Column("viscous_nms_per_rad", 1.0),)
     dissipative = True

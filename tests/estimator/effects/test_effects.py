@@ -94,6 +94,26 @@ def test_an_effect_with_a_key_is_nothing_at_the_files_own_value(joint: Joint) ->
             np.testing.assert_allclose(left, 0.0, atol=1e-12, err_msg=effect.name)
 
 
+@pytest.mark.parametrize("rated_nm", [0.1, 4e3])
+def test_ranges_hold_what_small_and_large_joints_have(rated_nm: float) -> None:
+    """Of parts of the rated torque: friction and waves a quarter, at 0.3 rad/s; a spring that gives by 0.5 to 50 mrad; a
+    rotor that the torque accelerates by 1 to 1000 rad/s2.
+    """
+    quarter = 0.25 * rated_nm
+    sizes = {
+        "Nm": (0.0, quarter),
+        "Nms/rad": (0.0, quarter / 0.3),
+        "Nm/s": (0.0, 1e-3 * rated_nm),
+        "Nm/K": (0.0, 0.02 * rated_nm),
+        "Nm/rad": (20.0 * rated_nm, 2000.0 * rated_nm),
+        "kg m2": (1e-7 * rated_nm, 1e-2 * rated_nm),  # behind a gear of 100 and without one
+    }
+    for effect in EFFECTS.values():
+        for p in effect.parameters:
+            low, high = sizes.get(p.unit, (p.low, p.high))
+            assert p.low <= low < high <= p.high, (effect.name, p)
+
+
 def test_an_unknown_temperature_changes_nothing() -> None:
     s = state(SEED + 5, 50)
     s.temperature_c = np.where(np.arange(50) % 2 == 0, np.nan, s.temperature_c)
