@@ -157,5 +157,5 @@ $(VENV)/.installed-dev: $(SOURCES)
 
 $(VENV)/.installed-test: $(SOURCES)
 	@echo "compiling jtqd, installing it into $(VENV) with the development tools and torch for training"
-	@.ci/install $(VENV) analysis dev train
+	@.ci/browser & .ci/install $(VENV) analysis dev train && wait
 	@touch $(VENV)/.installed $(VENV)/.installed-analysis $(VENV)/.installed-dev $@

@@ -15,7 +15,7 @@ from typing import Any
 
 # What is heavy to load is loaded in `_run`: Ctrl-C must find its handler installed, also in the first second.
 from jtqd import __version__
-from jtqd.daemon.live import NEEDED, Address, address, installed
+from jtqd.daemon.live import Address, address
 from jtqd.estimator.command_line import command_parser, printable_streams, seconds
 
 _EXAMPLES = """examples:
@@ -25,7 +25,7 @@ _EXAMPLES = """examples:
   jtqd --bus can0 --config /etc/jtqd/arm.yaml --record /var/log/jtqd
   jtqd --bus can0 --config arm/jtqd.yaml --guest     beside a PLC that is the master of the bus
   jtqd --bus can0 --ros2                joint states, torque states and diagnostics for ROS 2 nodes of this machine
-  jtqd --bus can0 --live                open ws://127.0.0.1:8765 in Foxglove, with the layout of `jtq layout`
+  jtqd --bus can0 --live                a page at http://127.0.0.1:8765; in Foxglove ws://127.0.0.1:8765
 
 exit status: 0 done, 1 failure, 2 usage or a wrong configuration, 3 done, but cycles are missing in the log"""
 
@@ -47,7 +47,9 @@ def parser() -> argparse.ArgumentParser:
     add("--record", metavar="DIR", help=text)
     text = "end after S seconds (default: run until stopped)"
     add("--duration", type=seconds, metavar="S", help=text)
-    text = "serve Foxglove or Lichtblick, read-only, 50 Hz (default: 127.0.0.1:8765; extra: live)"
+    text = (
+        "serve a page, read-only (default: http://127.0.0.1:8765), and Foxglove or Lichtblick (extra: live)"
+    )
     add("--live", type=address, nargs="?", const=Address(), metavar="HOST:PORT", help=text)
     text = "publish for ROS 2, 100 Hz, on loopback unless the configuration (ros2) states otherwise (extra: ros2)"
     add("--ros2", action="store_true", help=text)
@@ -100,9 +102,6 @@ def _run(arguments: argparse.Namespace, stop_requests: list[int]) -> int:
         parser().error(
             f"argument --bus: found a name of {len(arguments.bus)} characters, expected at most {_LONGEST_INTERFACE}"
         )
-    if arguments.live is not None and not installed():
-        print(f"jtqd: {NEEDED}", file=sys.stderr)
-        return 1
     from jtqd.daemon import ros2
     from jtqd.daemon.config import load_config
     from jtqd.daemon.supervisor.process import ConfigurationRefused, Supervisor, SupervisorError

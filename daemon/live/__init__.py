@@ -1,7 +1,7 @@
-"""Live view: what viewers get of a running daemon, and the layout file for Foxglove and Lichtblick.
+"""Live view: what others see of a running daemon: a page in the browser, Foxglove and Lichtblick, `jtq.status/1`.
 
-In comes the loop's shared memory; out go the log's topics, thinned out, on a websocket (extra `live`), and a layout.
-Here: the address (HOST:PORT of `jtqd --live`), and how the supervisor starts `process`. `layout` is `jtq layout`.
+In comes the loop's shared memory; out go the page and its events, and the log's topics, thinned out, on a websocket (extra
+`live`). Here: the address (HOST:PORT of `jtqd --live`), and how the supervisor starts `process`. `layout` is `jtq layout`.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8765
 _PACKAGE = "foxglove"
-NEEDED = "--live needs the package foxglove-sdk: pip install 'jtqd[live]'"
+NEEDED = "Foxglove and Lichtblick need the package foxglove-sdk: pip install 'jtqd[live]'"
 
 
 def installed() -> bool:
-    """Return whether the package that the live view needs is installed."""
+    """Return whether the package that Foxglove and Lichtblick need is installed."""
     return importlib.util.find_spec(_PACKAGE) is not None
 
 
@@ -34,10 +34,13 @@ class Address(NamedTuple):
     host: str = DEFAULT_HOST
     port: int = DEFAULT_PORT
 
-    @property
-    def url(self) -> str:
-        """URL for a viewer."""
-        return f"ws://[{self.host}]:{self.port}" if ":" in self.host else f"ws://{self.host}:{self.port}"
+    def of(self, scheme: str) -> str:
+        """Return its URL."""
+        return (
+            f"{scheme}://[{self.host}]:{self.port}"
+            if ":" in self.host
+            else f"{scheme}://{self.host}:{self.port}"
+        )
 
     @property
     def loopback(self) -> bool:

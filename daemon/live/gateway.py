@@ -1,7 +1,8 @@
-"""A TCP gateway before the websocket server of foxglove-sdk, which knows the subprotocol foxglove.sdk.v1 alone.
+"""A TCP gateway at the one address of the live view: the page in the browser, and the websocket server of foxglove-sdk.
 
-Older viewers ask for foxglove.websocket.v1, which has the same messages (Lichtblick's pull request 819): its name is
-exchanged in the handshake, and what follows passes unchanged. A client that asks for neither gets an answer that names both.
+That server knows the subprotocol foxglove.sdk.v1 alone. Older viewers ask for foxglove.websocket.v1, which has the same
+messages (Lichtblick's pull request 819): its name is exchanged in the handshake, and what follows passes unchanged. A
+request for neither is answered as HTTP (`web`).
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ import asyncio
 import re
 import threading
 from contextlib import suppress
+from http import HTTPStatus
 
-from jtqd.daemon.live import Address
+from jtqd.daemon.live import NEEDED, Address, web
 
 PROTOCOL, OLDER = "foxglove.sdk.v1", "foxglove.websocket.v1"
 _HEADER = re.compile(rb"^(sec-websocket-protocol: *)([^\r\n]*)", re.IGNORECASE | re.MULTILINE)
@@ -19,16 +21,9 @@ _END = b"\r\n\r\n"
 _LONGEST_HANDSHAKE = 16_384
 _HANDSHAKE_S = 5.0
 _CHUNK = 65_536
-_HELP = (
-    "jtqd's live view. Open this address in Foxglove or Lichtblick as a Foxglove WebSocket connection "
-    f"(websocket subprotocol {PROTOCOL} or {OLDER}), or run: jtq status\n"
-)
-
-
-def asked(request: bytes) -> list[str]:
-    """Return the subprotocols that a handshake offers."""
-    values = (value.decode("latin-1") for _, value in _HEADER.findall(request))
-    return [each.strip() for value in values for each in value.split(",")]
+_MOST_PAGES = 32
+_UNSENT = 262_144
+"""Bytes waiting for a page that does not read, some 10 s; what comes then is not for it."""
 
 
 def renamed(handshake: bytes, name: str) -> bytes:
@@ -36,21 +31,17 @@ def renamed(handshake: bytes, name: str) -> bytes:
     return _HEADER.sub(lambda found: found[1] + name.encode(), handshake)
 
 
-def refusal() -> bytes:
-    """Return the answer to a client that asks for no known subprotocol."""
-    body = _HELP.encode()
-    fields = "Content-Type: text/plain", f"Content-Length: {len(body)}", "Connection: close"
-    head = "\r\n".join(("HTTP/1.1 400 Bad Request", *fields, "", ""))
-    return head.encode() + body
-
-
 class Gateway:
-    """Listens at `address` (raises OSError) and passes connections on to the server at `inner`, in a thread of its own."""
+    """Listens at `address` (raises OSError), in a thread of its own.
 
-    def __init__(self, address: Address, inner: Address) -> None:
-        self._inner = inner
+    inner: of the websocket server; None: there is none.
+    """
+
+    def __init__(self, address: Address, inner: Address | None) -> None:
+        self._inner, self._names = inner, web.local_names(address.host)
         self._loop = asyncio.new_event_loop()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._pages: set[asyncio.StreamWriter] = set()
         try:
             listening = asyncio.start_server(self._serve, *address, limit=_LONGEST_HANDSHAKE)
             self._server = self._loop.run_until_complete(listening)
@@ -60,6 +51,20 @@ class Gateway:
         self.port: int = self._server.sockets[0].getsockname()[1]
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway", daemon=True)
         self._thread.start()
+
+    @property
+    def watched(self) -> bool:
+        """Return whether a page is open."""
+        return bool(self._pages)
+
+    def publish(self, events: bytes) -> None:
+        """Send events to every page; one that does not read loses them."""
+        self._loop.call_soon_threadsafe(self._publish, events)
+
+    def _publish(self, events: bytes) -> None:
+        for writer in self._pages:
+            if writer.transport.get_write_buffer_size() < _UNSENT:
+                writer.write(events)
 
     def stop(self) -> None:
         """End all connections and stop listening."""
@@ -88,17 +93,46 @@ class Gateway:
             writer.close()
 
     async def _connect(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        request = await asyncio.wait_for(reader.readuntil(_END), _HANDSHAKE_S)
-        names = asked(request)
-        if PROTOCOL not in names and OLDER not in names:
-            writer.write(refusal())
-            await writer.drain()
-            return
+        head = await asyncio.wait_for(reader.readuntil(_END), _HANDSHAKE_S)
+        try:
+            request = web.request_of(head)
+        except ValueError as error:
+            answer: bytes | None = web.text_answer(HTTPStatus.BAD_REQUEST, str(error))
+        else:
+            if (protocols := request.protocols) and not web.obstacle(request, self._names):
+                if self._inner is not None and (PROTOCOL in protocols or OLDER in protocols):
+                    await self._pass_on(head, PROTOCOL in protocols, reader, writer)
+                    return
+                known = f"websocket subprotocols: {PROTOCOL}, {OLDER}" if self._inner else NEEDED
+                answer = web.text_answer(HTTPStatus.BAD_REQUEST, known)
+            else:
+                answer = web.answer(request, self._names)
+        if answer is None and len(self._pages) >= _MOST_PAGES:
+            answer = web.text_answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{_MOST_PAGES} pages are open")
+        writer.write(web.STREAM_HEAD if answer is None else answer)
+        await writer.drain()
+        if answer is None:
+            await self._stream(reader, writer)
+
+    async def _stream(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Let `publish` write until the browser leaves; what it sends is dropped."""
+        self._pages.add(writer)
+        try:
+            while await reader.read(_CHUNK):
+                pass
+        finally:
+            self._pages.discard(writer)
+            writer.transport.abort()  # what a page did not read is not waited for
+
+    async def _pass_on(
+        self, head: bytes, newest: bool, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        assert self._inner is not None
         inside, outside = await asyncio.open_connection(*self._inner, limit=_LONGEST_HANDSHAKE)
         try:
-            outside.write(renamed(request, PROTOCOL))
+            outside.write(renamed(head, PROTOCOL))
             answer = await asyncio.wait_for(inside.readuntil(_END), _HANDSHAKE_S)
-            writer.write(answer if PROTOCOL in names else renamed(answer, OLDER))
+            writer.write(answer if newest else renamed(answer, OLDER))
             pumps = [asyncio.ensure_future(_pump(*ends)) for ends in ((reader, outside), (inside, writer))]
             try:
                 await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)

@@ -1,11 +1,11 @@
-"""The live view's process: `python -m jtqd.daemon.live.process REQUEST` reads the loop's shared memory and serves viewers.
+"""The live view's process, `python -m jtqd.daemon.live.process REQUEST`: the loop's memory, for pages and viewers.
 
-It sends one set of the cycle's messages per 20 ms, with the log's bytes; a change of status and a missed slot are seen in
-every cycle and sent as events. It maps ring, snapshot and notices read-only, and nothing that a viewer sends goes anywhere.
-A viewer that is too slow loses its oldest messages, not others theirs.
+Viewers get one set of the cycle's messages per 20 ms, with the log's bytes; a change of status and a missed slot are seen in
+every cycle and sent as events. Pages get `page_events`, made once for all. Ring, snapshot and notices are mapped read-only,
+and nothing that anybody sends goes anywhere. Who is too slow loses messages, not others theirs.
 
-REQUEST is the JSON of `recording.launch.loop_request` with "host" and "port". The answer is {"listening": URL} or {"failed":
-why} (`shared.processes`).
+REQUEST is the JSON of `recording.launch.loop_request` with "host" and "port". The answer is {"listening": where} or
+{"failed": why} (`shared.processes`).
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import foxglove
-
-from jtqd.daemon.live import Address
+from jtqd.daemon.live import NEEDED, Address, installed
 from jtqd.daemon.live.gateway import Gateway
+from jtqd.daemon.live.page_events import SAMPLE_NS, PageEvents
 from jtqd.daemon.recording import messages
 from jtqd.daemon.recording.diagnostics import LoopReader
 from jtqd.daemon.recording.messages import (
@@ -40,9 +39,6 @@ from jtqd.daemon.shared.processes import CannotBegin, Stop, run_side_process
 from jtqd.daemon.shared.runtime_dir import SharedMemoryError
 
 # ---- messages ----
-
-PERIOD_NS = 20_000_000
-"""50 Hz."""
 
 
 class Message(NamedTuple):
@@ -85,7 +81,7 @@ class LiveStream:
             realtime = max(realtime, 0)
             self.events.newest = (index, realtime)
             self.events.cycle(tuple(statuses), missed)
-            slot = monotonic // PERIOD_NS
+            slot = monotonic // SAMPLE_NS
             if slot == self._slot:
                 continue
             self._slot = slot
@@ -111,10 +107,12 @@ _BACKLOG = 512
 class LiveServer:
     """Serves one channel per topic of the log, with the log's schema; `name` is what viewers show.
 
-    Raises RuntimeError, OSError where it cannot listen at `address`.
+    Needs the extra `live`. Raises RuntimeError, OSError where it cannot listen.
     """
 
-    def __init__(self, name: str, address: Address, joints: int = 2, *, shadow: bool = False) -> None:
+    def __init__(self, name: str, joints: int = 2, *, shadow: bool = False) -> None:
+        import foxglove
+
         texts = messages.schemas_of(joints, shadow=shadow)
         self._context = context = foxglove.Context()  # server and channels hold it only weakly
         self._channels = {
@@ -136,12 +134,7 @@ class LiveServer:
             context=context,
             message_backlog_size=_BACKLOG,
         )
-        try:
-            self._gateway = Gateway(address, Address(_INNER_HOST, self._server.port))
-        except BaseException:
-            self._server.stop()
-            raise
-        self.address = Address(address.host, self._gateway.port)
+        self.address = Address(_INNER_HOST, self._server.port)
 
     @property
     def watched(self) -> bool:
@@ -154,7 +147,6 @@ class LiveServer:
 
     def stop(self) -> None:
         """Stop the server."""
-        self._gateway.stop()
         self._server.stop()
 
 
@@ -187,16 +179,24 @@ class Source:
         self.skip()
 
     def skip(self) -> None:
-        """Skip to the newest record while there is no viewer."""
+        """Skip to the newest record while nobody looks."""
         self._loop.skip()
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what viewers were sent while there is none."""
         self._stream.forget()
         if self._notices is not None:
             self._notices.read()
 
-    def read(self) -> list[Message]:
-        """Return the new messages."""
+    def records(self) -> list[bytes]:
+        """Return the new cycle records."""
+        return self._loop.ring.read().records
+
+    def messages(self, records: list[bytes]) -> list[Message]:
+        """Return the messages of these records, and of what has happened since."""
         stream, now_ns = self._stream, time.time_ns()
-        made = stream.take(self._loop.ring.read().records)
+        made = stream.take(records)
         for notice in () if self._notices is None else self._notices.read()[0]:
             stream.events.note(
                 EventKind.NOTICE,
@@ -214,34 +214,51 @@ class Source:
         return made + stream.take()
 
 
-def serve(source: Source, server: LiveServer, stop: Stop) -> int:
-    """Serve until stopped. Without a viewer it only follows the ring."""
+def serve(source: Source, gateway: Gateway, viewers: LiveServer | None, page: PageEvents, stop: Stop) -> int:
+    """Serve until stopped. Without anybody who looks it only follows the ring."""
     try:
         while not stop.requested:
-            if server.watched:
-                for message in source.read():
-                    server.send(message)
+            watched = viewers is not None and viewers.watched
+            if watched or gateway.watched:
+                records = source.records()
+                if viewers is None or not watched:
+                    source.forget()
+                else:
+                    for message in source.messages(records):
+                        viewers.send(message)
+                if gateway.watched and (events := page.take(records, time.monotonic_ns())):
+                    gateway.publish(events)
             else:
                 source.skip()
             time.sleep(_POLL_S)
     finally:
-        server.stop()
+        gateway.stop()
+        if viewers is not None:
+            viewers.stop()
     return 0
 
 
 def begin(request: dict[str, Any]) -> tuple[str, Callable[[Stop], int]]:
-    """Open memory and server; returns the URL, and what serves viewers. Raises CannotBegin."""
+    """Open memory and servers; returns where they listen, and what serves. Raises CannotBegin."""
     address = Address(request["host"], request["port"])
     obstacle = _obstacle(address)
     if obstacle:
         raise CannotBegin(f"{address.host}:{address.port}: {obstacle}")
+    viewers = None
     try:
         source = Source(request)
         count, shadow = len(request["joint_names"]), request["shadow"]
-        server = LiveServer(f"jtqd on {request['bus']}", address, count, shadow=shadow)
+        page = PageEvents(Path(request["snapshot"]).parent, count, shadow=shadow)
+        if installed():
+            viewers = LiveServer(f"jtqd on {request['bus']}", count, shadow=shadow)
+        gateway = Gateway(address, None if viewers is None else viewers.address)
     except (SharedMemoryError, RuntimeError, OSError, ValueError) as error:
+        if viewers is not None:
+            viewers.stop()
         raise CannotBegin(f"{address.host}:{address.port}: {error}") from None
-    return server.address.url, partial(serve, source, server)
+    where = Address(address.host, gateway.port)
+    others = NEEDED if viewers is None else f"Foxglove and Lichtblick: {where.of('ws')}"
+    return f"{where.of('http')}  ({others})", partial(serve, source, gateway, viewers, page)
 
 
 if __name__ == "__main__":

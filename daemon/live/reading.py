@@ -12,19 +12,19 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from math import nan
+from math import isfinite, nan
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from jtqd.daemon.recording.run_files import Account, read_account
-from jtqd.daemon.shared.conditions import SEVERITIES, Condition, read_conditions
+from jtqd.daemon.shared.conditions import DEVIATION_SIGMAS, SEVERITIES, Condition, read_conditions
 from jtqd.daemon.shared.events import FILE as NOTICES
 from jtqd.daemon.shared.events import Notice, NoticesReader
 from jtqd.daemon.shared.reasons import contact_of, drive_state, joint_reason
-from jtqd.daemon.shared.runtime_dir import About, SharedMemoryError, json_of
-from jtqd.daemon.shared.snapshot import SnapshotReader, View, bus_load
+from jtqd.daemon.shared.runtime_dir import About, AboutJoint, SharedMemoryError, json_of
+from jtqd.daemon.shared.snapshot import JointView, SnapshotReader, View, bus_load
 from jtqd.drivers import nmt
-from jtqd.estimator.status import NAMES, PUBLISHED
+from jtqd.estimator.status import NAMES, PUBLISHED, Zeros
 from jtqd.estimator.text import finite
 
 SCHEMA: Final = "jtq.status/1"
@@ -257,6 +257,19 @@ def content(reading: Reading) -> dict[str, Any]:
     }
 
 
+def _ratios(joint: AboutJoint, seen: JointView, zeros: Zeros, *, known: bool) -> dict[str, float]:
+    """Return what is watched as a share of its limit, where it is known; above 1 a condition or a status follows."""
+    shares = {
+        "sensor": abs(seen.torque_nm - seen.reference_nm) / (DEVIATION_SIGMAS * seen.sigma_nm or nan)
+        if known
+        else nan,
+        "network": abs(seen.network_nm - seen.physics_nm) / (joint.network_limit_nm or nan),
+        "link_zero": abs(zeros.link_rad) / (zeros.limit_rad or nan) if zeros.learned else nan,
+        "contact": abs(seen.contact_nm) / (joint.contact_threshold_nm or nan),
+    }
+    return {name: share for name, share in shares.items() if isfinite(share)}
+
+
 def _joint_content(reading: Reading, view: View, earlier: View, n: int) -> dict[str, Any]:
     about, seen, measured = reading.daemon.about, view.joints[n], view.measured[n]
     running = reading.state == RUNNING
@@ -278,6 +291,7 @@ def _joint_content(reading: Reading, view: View, earlier: View, n: int) -> dict[
         "age_ms": finite(seen.age_ms),
         "shadow": {name: each.content() for name, each in view.shadows[n].items()},
         "zeros": view.zeros[n].content(),
+        "ratios": _ratios(about.joints[n], seen, view.zeros[n], known=known) if running else {},
         "contact": contact_of(seen) if running else None,
         "contact_nm": finite(seen.contact_nm if running else nan),
         "contact_threshold_nm": about.joints[n].contact_threshold_nm,

@@ -125,8 +125,8 @@ class LiveProcess:
             text=True,
         )
         self.answer = json.loads(self.process.stdout.readline() or "{}")
-        self.url = self.answer.get("listening", "")
-        self.port = int(self.url.rpartition(":")[2] or 0)
+        found = re.search(r"ws://[^)]+:(\d+)", self.answer.get("listening", ""))
+        self.url, self.port = (found[0], int(found[1])) if found else ("", 0)
 
     def __enter__(self):
         return self
@@ -149,6 +149,17 @@ class LiveProcess:
     def resident_mb(self):
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def asked(port, path, *headers, host="127.0.0.1", method="GET"):
+    """The whole answer to a request whose connection the server closes."""
+    lines = (f"{method} {path} HTTP/1.1", f"Host: {host}", *headers, "", "")
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
+        client.sendall("\r\n".join(lines).encode())
+        parts = []
+        while part := client.recv(65536):
+            parts.append(part)
+    return b"".join(parts)
 
 
 class Viewer:
