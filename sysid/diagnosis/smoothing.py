@@ -207,15 +207,16 @@ def _counts(values: FloatArray, printed: FloatArray, *, again: bool) -> float:
     good = np.flatnonzero(apart > _SAME * max(float(np.max(np.abs(values))), 1e-12))
     order = good[np.argsort(apart[good])]
     apart, coarse = apart[order], coarse[order]
-    for few in range(1, _FEW + 1):
-        step = float(np.min(apart[coarse < _COARSE * apart], initial=math.inf)) / few
+    seen = apart[coarse < _COARSE * apart]
+    for few in range(1, _FEW + 1) if len(seen) else ():
+        step = float(seen[0]) / few
         known = np.flatnonzero(coarse < _COARSE * step)
         for k in range(1, len(known).bit_length() + 1):
             least = apart[known[: 2**k]]
             times = np.round(least / step)
-            step = float(times @ least) / max(float(times @ times), 1.0) or math.inf
+            step = float(times @ least) / max(float(times @ times), 1.0) or step
         times = np.round(apart[known] / step)
-        on = np.abs(apart[known] / step - times) < _OFF + coarse[known] / step
+        on = (times > 0.0) & (np.abs(apart[known] / step - times) < _OFF + coarse[known] / step)
         if len(on) >= _SHOWN and (again or len(np.unique(times)) > 2) and on.mean() >= _ON_GRID:
             return step
     return 0.0

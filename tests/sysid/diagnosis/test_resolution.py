@@ -99,6 +99,14 @@ def test_the_grid_of_an_encoder_is_one_for_slow_steady_and_quick_motion(bits: in
     assert steps_of(x) == pytest.approx(np.maximum(step, printed), rel=1e-3)
 
 
+@pytest.mark.parametrize("decimals", [2, 3, 4])
+@pytest.mark.parametrize("count", [7, 12])
+def test_a_velocity_that_is_printed_with_few_decimals_has_their_step(decimals: int, count: int) -> None:
+    """Values that come many times; few about zero show none."""
+    x = digits(np.round(150.0 * np.sin(2.0 * np.pi * 0.3 * np.arange(0.0, 20.0, 1e-3)), decimals), count)
+    assert steps_of(x)[np.abs(x) > 1.0] == pytest.approx(10.0**-decimals, rel=1e-6)
+
+
 def test_a_steady_motion_is_no_grid() -> None:
     rng = np.random.default_rng(0)
     x = 1000.0 + 0.1 * np.arange(400) + 1e-4 * rng.normal(size=400)
