@@ -19,12 +19,12 @@ The torque of a joint that turns at 1 rad/s with 3 A, from arrays:
 
 The same sample by sample, as in a control loop: the first sample starts the observer and publishes nothing.
 
->>> from jtqd.estimator import make_estimator, status
+>>> from jtqd.estimator import make_estimator
 >>> estimator = make_estimator(joint, settings)
 >>> for t in time_s:
 ...     estimate = estimator.step(0.001, 3.0, t * joint.gear_ratio, joint.gear_ratio, t)
->>> print(f"{estimate.torque_nm:.2f} Nm, {status.NAMES[estimate.status]}")
-10.01 Nm, valid
+>>> print(f"{estimate.torque_nm:.2f} Nm, {estimate.status!r}")
+10.01 Nm, <Status.VALID: 2>
 """
 
 from importlib import import_module
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from jtqd.estimator.settings import METHODS as METHODS
     from jtqd.estimator.settings import EstimatorSettings as EstimatorSettings
     from jtqd.estimator.status import Estimate as Estimate
+    from jtqd.estimator.status import Status as Status
 else:  # each process of the daemon imports this package for a few of its modules
     _NAMES = {
         "errors": ("ConfigError",),
@@ -53,7 +54,7 @@ else:  # each process of the daemon imports this package for a few of its module
         "network": ("NetworkError", "load_network"),
         "run": ("EstimateRun", "JointColumns", "RunTable", "RunTableError"),
         "settings": ("METHODS", "EstimatorSettings"),
-        "status": ("Estimate",),
+        "status": ("Estimate", "Status"),
     }
     _MODULES = {name: module for module, names in _NAMES.items() for name in names}
     __all__ = list(_MODULES)

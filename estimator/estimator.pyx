@@ -47,7 +47,7 @@ from jtqd.estimator.native_network import OUTSIDE
 from jtqd.estimator.network import FEATURES, check_fit, native_of, path_section
 from jtqd.estimator.run import INPUTS, EstimateRun, ObservedRun
 from jtqd.estimator.settings import METHODS, largest_torque_nm
-from jtqd.estimator.status import Estimate
+from jtqd.estimator.status import Estimate, Status
 from jtqd.estimator.fusion import FOREIGN_SIGMAS, ONE_WAY
 
 STANDSTILL_SIGMAS: Final = 3.0
@@ -122,7 +122,7 @@ cdef class Estimator:
         cdef Values out
         no_values(&out, INVALID)  # of an estimator that raises, which Python prints
         self.advance(&sample, network_wanted, &out)
-        return Estimate(out.torque_nm, out.sigma_nm, out.status, out.tob_nm, out.physics_nm, out.network_nm)
+        return Estimate(out.torque_nm, out.sigma_nm, Status(out.status), out.tob_nm, out.physics_nm, out.network_nm)
 
     def run(
         self, dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, temperature_c=None,

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray, StatusArray
+from jtqd.estimator.status import NAMES
 
 
 class RunTableError(ValueError):
@@ -48,6 +49,12 @@ class JointColumns:
             column = getattr(self, item.name)
             if column is not None:
                 object.__setattr__(self, item.name, _read_only(column, item.name))
+
+    def __repr__(self) -> str:
+        there = {
+            item.name: column for item in fields(self) if (column := getattr(self, item.name)) is not None
+        }
+        return f"JointColumns({max(map(len, there.values()), default=0)} rows: {', '.join(there)})"
 
     def map(self, change: Callable[[str, FloatArray], FloatArray]) -> JointColumns:
         """Return a copy with `change(name, column)` in place of each column that is there."""
@@ -138,6 +145,11 @@ class RunTable:
                     )
                 _check_finite(column, f"j{number}.{name}")
 
+    def __repr__(self) -> str:
+        first, last = self.time_s[0], self.time_s[-1]
+        joints = ", ".join(map(str, self.joints))
+        return f"RunTable({len(self.time_s)} rows, {first:g} to {last:g} s, joints {joints})"
+
     def __reduce__(self) -> tuple[type[RunTable], tuple[FloatArray, dict[int, JointColumns]]]:
         """Copy and pickle through a plain dict: a mapping proxy can do neither."""
         return RunTable, (self.time_s, dict(self.joints))
@@ -213,6 +225,11 @@ class EstimateRun:
     def __post_init__(self) -> None:
         for name in self.__slots__:
             getattr(self, name).setflags(write=False)
+
+    def __repr__(self) -> str:
+        codes, counts = np.unique(self.status, return_counts=True)
+        found = ", ".join(f"{NAMES[int(code)]} {count}" for code, count in zip(codes, counts, strict=True))
+        return f"EstimateRun({len(self.status)} rows: {found})"
 
 
 def _slope(position: FloatArray, time_s: FloatArray) -> FloatArray:

@@ -5,28 +5,25 @@ The status codes are those published on the bus (low or high nibble of the estim
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
-OFF: Final = 0
-STARTING: Final = 1
-VALID: Final = 2
-# the network is not fully used: outside its envelope, far from physics, or no time for it
-DEGRADED: Final = 3
-STALE: Final = 4  # an input of this cycle is missing (set by the loop, never by the estimator)
-DRIVE_FAULT: Final = 5  # set by the loop, never by the estimator
-STANDSTILL: Final = 6  # known to an interval only; sigma is its half width
-INVALID: Final = 15
 
-NAMES: Final = {
-    OFF: "off",
-    STARTING: "starting",
-    VALID: "valid",
-    DEGRADED: "degraded",
-    STALE: "stale",
-    DRIVE_FAULT: "drive_fault",
-    STANDSTILL: "standstill",
-    INVALID: "invalid",
-}
+class Status(IntEnum):
+    """What may be known of a torque. The loop alone sets OFF, STALE and DRIVE_FAULT."""
+
+    OFF = 0
+    STARTING = 1
+    VALID = 2
+    DEGRADED = 3  # the network is not fully used: outside its envelope, far from physics, or no time for it
+    STALE = 4  # an input of this cycle is missing
+    DRIVE_FAULT = 5
+    STANDSTILL = 6  # known to an interval only; sigma is its half width
+    INVALID = 15
+
+
+OFF, STARTING, VALID, DEGRADED, STALE, DRIVE_FAULT, STANDSTILL, INVALID = Status
+NAMES: Final = {each.value: each.name.lower() for each in Status}
 
 PUBLISHED: Final = frozenset((VALID, DEGRADED, STANDSTILL))
 """Only with these may a torque number leave the estimator."""
@@ -52,7 +49,7 @@ class Estimate(NamedTuple):
 
     torque_nm: float
     sigma_nm: float
-    status: int
+    status: Status
     tob_nm: float
     physics_nm: float
     network_nm: float

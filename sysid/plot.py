@@ -7,7 +7,7 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from jtqd.estimator.status import (
 from jtqd.estimator.text import counted, finite
 from jtqd.sysid.report.page import check_picture, shade
 
-_SHADES = {
+_SHADES: Final[dict[int, str]] = {
     STANDSTILL: "#dcecf2",
     DEGRADED: "#fbe8c8",
     STARTING: "#e3f0d8",

@@ -370,6 +370,10 @@ class Findings:
     trust: Mapping[str, float] = field(default_factory=dict)
     provenance: Provenance | None = None
 
+    def __repr__(self) -> str:
+        found = (f"{each.name} of {joint_text(each.joint)} ({each.grade})" for each in self.causes)
+        return f"Findings({': '.join((self.verdict, *filter(None, [', '.join(found)])))}; {self.runs_text})"
+
     @property
     def used_runs(self) -> tuple[str, ...]:
         """Runs that what was found is of."""

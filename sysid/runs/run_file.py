@@ -46,6 +46,9 @@ class RunFile:
     known_loads: tuple[int, ...] = ()
     known_parts: Mapping[int, FloatArray] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        return f"RunFile({self.name}, {self.source}, {self.table!r})"
+
 
 @dataclass(frozen=True)
 class Content:

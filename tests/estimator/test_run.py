@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import pickle
 from dataclasses import replace
 
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.estimator import JointEstimator
-from jtqd.estimator.run import JointColumns, RunTable, RunTableError
+from jtqd.estimator.run import EstimateRun, JointColumns, RunTable, RunTableError
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import NAMES, STANDSTILL, Status
 from tests.estimator.estimator_helpers import joint1
 
 T = np.cumsum(np.random.default_rng(1).uniform(0.0005, 0.002, 400))
@@ -102,3 +104,23 @@ def test_tables_are_read_only_and_can_be_copied() -> None:
     assert T.flags.writeable  # the caller's own array is left alone
     for other in (pickle.loads(pickle.dumps(table)), copy.deepcopy(table)):
         assert np.array_equal(other.joints[1].current_a, FULL.current_a)
+
+
+def test_what_a_session_prints_is_one_line_without_arrays() -> None:
+    time_s = 0.5 * np.arange(2000)
+    columns = JointColumns(current_a=np.zeros(2000), link_position_rad=time_s)
+    assert repr(columns) == "JointColumns(2000 rows: current_a, link_position_rad)"
+    assert repr(JointColumns()) == "JointColumns(0 rows: )"
+    assert (
+        repr(RunTable(time_s, {1: columns, 4: columns})) == "RunTable(2000 rows, 0 to 999.5 s, joints 1, 4)"
+    )
+    status = np.repeat(np.array([6, 2], np.uint8), (3, 5))
+    values = {name: np.zeros(8) for name in EstimateRun.__slots__ if name != "status"}
+    assert repr(EstimateRun(status=status, **values)) == "EstimateRun(8 rows: valid 5, standstill 3)"
+
+
+def test_a_status_is_its_code_and_has_its_name() -> None:
+    assert [(int(each), each.name.lower()) for each in Status] == list(NAMES.items())
+    assert Status(np.uint8(6)) is STANDSTILL
+    assert json.dumps([Status.VALID]) == "[2]"
+    assert f"{Status.INVALID}" == "15"

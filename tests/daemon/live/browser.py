@@ -42,7 +42,7 @@ class Browser:
             assert time.monotonic() < end, log.read_text()
             assert self._process.poll() is None, log.read_text()
             time.sleep(0.05)
-        self._socket = connect(found[1], max_size=None).__enter__()
+        self._socket = connect(found[1], max_size=None, ping_interval=None).__enter__()
         self._session = None
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]

@@ -337,3 +337,15 @@ def test_a_row_of_every_entry_has_its_smallest_size() -> None:
     texts = [candidate_row(replace(row, minimum=each)) for each in ({}, seen, never)]
     assert [each[3].replace(NARROW, " ") for each in texts] == ["–", "0.050 Nm", "–"]
     assert texts[0][:3] == ("unbalance", "joint 1", "cannot be told from these runs")
+
+
+@pytest.mark.parametrize("make", examples.EXAMPLES.values())
+def test_what_a_session_prints_is_one_line_with_every_cause(make: Callable[[], Findings]) -> None:
+    findings = make()
+    shown = repr(findings)
+    assert shown.startswith(f"Findings({findings.verdict}")
+    assert shown.endswith(f"; {findings.runs_text})")
+    assert re.findall(r"(\w+) of [\w ]+ \((\w+)\)", shown) == [
+        (each.name, each.grade) for each in findings.causes
+    ]
+    assert "\n" not in shown

@@ -529,6 +529,7 @@ def test_a_directory_is_its_tables_and_names_are_unique(tmp_path):
     read = read_runs([one, other / "a.csv.gz"])
     assert [run.name for run in read] == ["a.csv.gz", str(other / "a.csv.gz")]
     assert [(run.path, run.source) for run in read] == [(d / "a.csv.gz", "csv") for d in (one, other)]
+    assert repr(read[0]) == f"RunFile(a.csv.gz, csv, {read[0].table!r})"
     for segments in (False, True):
         with pytest.raises(RunError, match=r"one/a\.csv\.gz: found it twice, expected every run once"):
             read_runs([one, one / "a.csv.gz"], segments=segments)
