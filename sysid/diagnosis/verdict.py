@@ -389,7 +389,7 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
     unexplained = _unexplained(rest, held_nm(left), limits_nm, dataset, left_share)
     conflict = sum(j.far > limits.SURE for j in effects) >= limits.CONFLICT
     found = sorted(
-        (_cause(solution, j, total_nm2, rest, limits_nm, conflict) for j in effects),
+        (_cause(solution, j, total_nm2, rest, limits_nm, conflict=conflict) for j in effects),
         key=lambda x: -x[0].rms_nm,
     )
     causes = [cause for cause, _ in found]
@@ -426,6 +426,7 @@ def _cause(
     total_nm2: float,
     rest: Unexplained,
     limits_nm: Mapping[Channel, float],
+    *,
     conflict: bool,
 ) -> tuple[Cause, float]:
     """Return an effect as a cause, and its size in parts of its limit, which is that of the first joint for the sensor."""
