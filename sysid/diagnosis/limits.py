@@ -130,9 +130,7 @@ RIVAL: Final = 6.0
 SURE: Final = 3.0
 """Standard deviations by which a certain entry differs from none."""
 CONFLICT: Final = 3
-"""Entries of one set that are SURE prior deviations from the file, from which it is at odds with the priors (prior-data
-conflict: Evans and Moshonov 2006, Bayesian Analysis 1): what makes a whole balance larger or smaller is none of them.
-"""
+"""Entries SURE prior deviations from the file that are at odds with the priors (Evans, Moshonov 2006, Bayesian Anal. 1)."""
 AGREE: Final = 0.06
 """Standard error of the mean size of a certain entry over the runs, part of it; runs are what is independent."""
 SEEN: Final = 0.05
