@@ -37,7 +37,7 @@ class Browser:
         with log.open("w") as file:
             command = [CHROMIUM, f"--user-data-dir={profile}", *_OPTIONS]
             self._process = subprocess.Popen(command, stdout=file, stderr=file)
-        end = time.monotonic() + 30.0
+        end = time.monotonic() + 60.0
         while not (found := re.search(r"DevTools listening on (ws://\S+)", log.read_text())):
             assert time.monotonic() < end, log.read_text()
             assert self._process.poll() is None, log.read_text()
@@ -65,7 +65,7 @@ class Browser:
             message["sessionId"] = self._session
         self._socket.send(json.dumps(message))
         while True:
-            answer = json.loads(self._socket.recv(timeout=20.0))
+            answer = json.loads(self._socket.recv(timeout=60.0))
             if answer.get("id") == self._count:
                 assert "error" not in answer, answer
                 return answer["result"]
@@ -104,7 +104,7 @@ class Browser:
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
-    def until(self, expression, timeout_s=10.0):
+    def until(self, expression, timeout_s=60.0):
         """The value of an expression once it is true."""
         end = time.monotonic() + timeout_s
         while not (value := self.value(expression)):
