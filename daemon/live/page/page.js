@@ -84,29 +84,35 @@ function padded(u, low, high) {
 }
 
 class Card {
-  constructor(index, methods) {
+  constructor(index) {
     this.number = index + 1;
-    this.methods = methods;
+    this.methods = [];
     this.element = byId("joint").content.firstElementChild.cloneNode(true);
     this.element.setAttribute("aria-labelledby", "joint-" + this.number);
     this.find(".name").id = "joint-" + this.number;
     this.hidden = new Set();
     this.columns = {};
     this.rows = {};
-    const rows = [["estimate", "estimate"], ["sensor", "sensor"], ...methods.map((each) => [each, each])];
-    for (const [key, name] of rows) this.addRow(key, name);
+    for (const name of ["estimate", "sensor"]) this.addRow(name);
     byId("joints").append(this.element);
   }
 
   find(selector) { return this.element.querySelector(selector); }
 
-  addRow(key, name) {
+  addMethod(name) { // in the first cycles none is known
+    this.methods.push(name);
+    this.addRow(name);
+    if (this.columns.time_s) this.columns[name + "_ratio"] = this.columns.time_s.map(() => null);
+    this.trace = null;
+  }
+
+  addRow(key) {
     const row = made("tr"), head = made("th"), button = made("button");
     head.scope = "row";
     button.type = "button";
     button.title = "show or hide";
     button.setAttribute("aria-pressed", "true");
-    button.append(made("span", "", "key " + key), name);
+    button.append(made("span", "", "key " + key), key);
     button.addEventListener("click", () => {
       const hide = !this.hidden.delete(key);
       if (hide) this.hidden.add(key);
@@ -184,9 +190,11 @@ class Card {
   show(joint = this.joint) {
     if (!joint) return;
     this.joint = joint;
+    for (const name of Object.keys(joint.shadow)) if (!this.methods.includes(name)) this.addMethod(name);
     put(this.find(".name"), "Joint " + joint.joint + (/^joint_?\d$/.test(joint.name) ? "" : ", " + joint.name));
     mark(this.find(".badge"), LEVELS[joint.status] ?? ["bad", "✕"], words(joint.status));
-    put(this.find(".torque b"), number(joint.torque_nm, 2, true));
+    put(this.find(".torque b"), joint.torque_nm === null ? "no torque" : number(joint.torque_nm, 2, true));
+    this.find(".unit").hidden = joint.torque_nm === null;
     put(this.find(".sigma"), joint.sigma_nm === null ? "" : "± " + number(joint.sigma_nm, 2));
     this.find(".ratios").hidden = joint.reference_nm === null && !this.columns.ratio?.some((each) => each !== null);
     put(this.find(".reason"), joint.reason ?? "");
@@ -232,12 +240,11 @@ function drawHistogram({ bin_us: width, work, late }) {
   const count = Math.ceil(length / step), bins = [...Array(count).keys()];
   const data = [bins.map((n) => (n + 0.5) * step * width), bins.map((n) => sum(work, n)), bins.map((n) => sum(late, n))];
   const top = Math.max(10, ...data[1], ...data[2]);
-  const floor = (u) => u.scales.y.min;
   histogram ??= plot(byId("histogram"), {
     cursor: { show: false },
     scales: { x: { time: false, range: () => [0, histogram?.end ?? count * step * width] }, y: { distr: 3, range: () => [0.7, histogram?.top ?? top * 2] } },
     series: [{},
-      { stroke: colour("estimate"), fill: colour("estimate"), width: 0, paths: uPlot.paths.bars({ size: [0.9, 40] }), fillTo: floor, points: { show: false } },
+      { stroke: colour("estimate"), fill: colour("estimate"), width: 0, paths: uPlot.paths.bars({ size: [0.9, 40] }), fillTo: (u) => u.scales.y.min, points: { show: false } },
       { stroke: colour("motor"), width: 2, paths: uPlot.paths.stepped({ align: 1 }), points: { show: false } }],
     axes: [axis({ size: 26, space: 60, values: (u, at) => at.map((each) => each + " µs") }),
       axis({ size: 46, splits: () => [1, 10, 100, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8], filter: (u, at) => at, values: (u, at) => at.map((each) => (Math.log10(each) % 2 ? "" : each < 1e3 ? each : each < 1e6 ? each / 1e3 + "k" : each / 1e6 + "M")) })],
@@ -313,7 +320,7 @@ function showVerdict() {
 function showState() {
   put(byId("bus"), `on ${state.instance}`);
   if (!state.joints) return;
-  while (cards.length < state.joints.length) cards.push(new Card(cards.length, Object.keys(state.joints[cards.length].shadow)));
+  while (cards.length < state.joints.length) cards.push(new Card(cards.length));
   state.joints.forEach((each, n) => cards[n].show(each));
   const { bus_load: load, counters, work_us: work, late_us: late, bus_state: bus, recorder } = state;
   lines(byId("conditions"), state.conditions.map((each) => [SEVERITY[each.severity] ?? ["info", "◆"], `${each.subject}: ${each.text} (for ${number(each.for_s, 1)} s)`]), "None");

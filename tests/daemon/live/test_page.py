@@ -449,6 +449,7 @@ def test_chromium_draws_it_at_two_widths_in_both_colours(page):
 
 def test_its_numbers_are_those_of_the_snapshot_and_of_the_ring(page, live):
     assert page.value("document.querySelector('.torque').innerText").split() == ["+12.34", "±", "0.25", "Nm"]
+    assert page.value("document.querySelectorAll('.torque')[1].innerText").strip() == "no torque"
     cells = "(row) => row.innerText.split(/\\s+/)"
     rows = f"(each) => [...each.querySelectorAll('tbody tr')].map({cells})"
     one, two = page.value(f"[...document.querySelectorAll('article')].map({rows})")
@@ -464,6 +465,19 @@ def test_its_numbers_are_those_of_the_snapshot_and_of_the_ring(page, live):
     values = cr.joint_of(record_of(cycle), 1)
     assert torque == values.torque_nm
     assert ratio == pytest.approx((values.torque_nm - values.reference_nm) / values.sigma_nm)
+
+
+def test_a_shadow_method_that_comes_later_is_drawn_too(page):
+    page.value(
+        "state.joints[0].shadow.tob = {torque_nm: 1.5, sigma_nm: 0.5, reference_nm: 1, rmse_nm: 2}; showState()"
+    )
+    row = page.value(
+        "[...document.querySelectorAll('tbody tr')].find((row) => row.innerText.startsWith('tob')).innerText"
+    )
+    assert row.split() == ["tob", "+1.50", "0.50", "+0.50", "2.00"]
+    page.until("cards[0].trace?.series.some((each) => each.label === 'tob')")
+    assert page.value("new Set(Object.values(cards[0].columns).map((each) => each.length)).size") == 1
+    assert page.errors == []
 
 
 def test_keys_and_names_for_those_who_do_not_see_it(page):
