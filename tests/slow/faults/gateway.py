@@ -14,6 +14,7 @@ from a generator of the case: the same seed gives the same frames.
 
 from __future__ import annotations
 
+import math
 import random
 import struct
 from collections.abc import Callable, Sequence
@@ -179,6 +180,22 @@ def saturated(span: int) -> Change:
         return min(max(value, first[0] - span), first[0] + span)
 
     return change
+
+
+def losing(part: float) -> Change:
+    """Of what it counts from now on it loses a part."""
+    first: list[int] = []
+
+    def change(n: int, value: int, traffic: Traffic) -> int:
+        first.append(value) if not first else None
+        return value - round(part * (value - first[0]))
+
+    return change
+
+
+def eccentric(size: int, waves: int, turn: float) -> Change:
+    """An error of so many waves per turn, which has so many counts."""
+    return lambda n, value, traffic: value + round(size * math.sin(2.0 * math.pi * waves * value / turn))
 
 
 def swapped(name: str, node: int) -> Change:

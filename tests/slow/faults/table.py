@@ -6,6 +6,7 @@ the range of its own. Rows know nothing of what jtqd looks for.
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -86,8 +87,8 @@ class Row:
 _UNIT: Final = {"motor position": "rad", "link position": "rad", "motor velocity": "rad/s", "current": "A"}
 
 
-def _number_rows(name: str) -> list[Row]:
-    """Return the rows of one number of a drive."""
+def _number_rows(name: str, *, more: bool = False) -> list[Row]:
+    """Return the rows of one number of a drive; more: those of LATER."""
 
     def row(kind: str, change: Callable[[Draw], tuple[Change, str]], seconds: float | None = 0.0) -> Row:
         def make(draw: Draw) -> Drawn:
@@ -147,7 +148,16 @@ def _number_rows(name: str) -> list[Row]:
             return gw.swapped(name, draw.other), f"that of drive {draw.other}"
         return gw.swapped(other, draw.node), other
 
+    def losing(draw: Draw) -> tuple[Change, str]:
+        part = draw.rng.choice((-1.0, 1.0)) * draw.between(3e-4, 0.3)
+        return gw.losing(part), f"{100 * part:.3g} %"
+
+    def eccentric(draw: Draw, counts: int) -> Change:
+        return gw.eccentric(counts, draw.rng.choice((1, 2)), 2.0 * math.pi / draw.unit(name))
+
     whole = None
+    if more:
+        return [row("loses counts", losing), sized("eccentric", eccentric)]
     return [
         row("frozen", lambda draw: (gw.frozen(), "")),
         row("held for some cycles", held),
@@ -169,7 +179,7 @@ def _number_rows(name: str) -> list[Row]:
     ]
 
 
-def _frame_rows() -> list[Row]:
+def _frame_rows(*, more: bool = False) -> list[Row]:
     def ids(draw: Draw) -> tuple[int, ...]:
         """Return one PDO of the drive or both."""
         both = (0x180 + draw.node, 0x280 + draw.node)
@@ -309,6 +319,18 @@ def _frame_rows() -> list[Row]:
 
         return make
 
+    def again_as_other(draw: Draw) -> tuple[Act, str, float | None]:
+        away, words, seconds = again(None)(draw)
+        data, _ = other_pdo(draw, (0x180 + draw.node, 0x280 + draw.node))
+
+        def act(n: int, traffic: gw.Traffic) -> None:
+            away(n, traffic)
+            data(n, traffic)
+
+        return act, words, seconds
+
+    if more:
+        return [of_drive("restart, data of the other", again_as_other, "nodes")]
     rows += [
         of_drive("all PDOs of a drive repeated", all_repeated, "frames"),
         of_drive("all PDOs of a drive old", all_old, "frames"),
@@ -351,7 +373,13 @@ def _frame_rows() -> list[Row]:
     return rows
 
 
-ROWS: Final = (*(row for name in NUMBERS for row in _number_rows(name)), *_frame_rows())
+EARLIER: Final = (*(row for name in NUMBERS for row in _number_rows(name)), *_frame_rows())
+LATER: Final = (
+    *(row for name in POSITIONS for row in _number_rows(name, more=True)),
+    *_frame_rows(more=True),
+)
+"""Dealt by a draw of their own: they change no case of the earlier ones."""
+ROWS: Final = (*EARLIER, *LATER)
 
 
 # The draw --------------------------------------------------------------------------------------------------------------
@@ -381,12 +409,19 @@ def _active(draw: Draw, row: Row, begin: int) -> tuple[Active, str, tuple[tuple[
 
 def singles(seed: int, per_row: int = CASES_PER_ROW) -> list[Case]:
     """Return the cases of single faults: `per_row` of each row, its range of magnitudes in as many parts."""
-    rng = rng_of(seed, "singles")
-    places = _dealt(rng, len(ROWS) * per_row)
+    return [
+        *_dealt_singles(seed, per_row, "singles", EARLIER),
+        *_dealt_singles(seed, per_row, "later", LATER),
+    ]
+
+
+def _dealt_singles(seed: int, per_row: int, name: str, rows: tuple[Row, ...]) -> list[Case]:
+    rng = rng_of(seed, name)
+    places = _dealt(rng, len(rows) * per_row)
     cases = []
-    for number, row in enumerate(ROWS):
+    for number, row in enumerate(rows):
         # the deals of a row are apart, so that its cases have different plants and states
-        mine = places[number :: len(ROWS)]
+        mine = places[number :: len(rows)]
         order = list(range(per_row))
         rng.shuffle(order)
         for k, (plant, state) in enumerate(mine):
@@ -420,7 +455,7 @@ def pairs(seed: int, count: int = PAIRS) -> list[Case]:
         own = rng_of(seed, "pair", k)
         run = runs_of(plant, seed)[state]
         node = own.choice((1, 2))
-        one, two = own.sample(ROWS, 2)
+        one, two = own.sample(EARLIER, 2)
         made = []
         for row, at in ((one, node), (two, node if own.random() < 0.75 else 3 - node)):
             begin = round(1000 * own.uniform(*BEGIN_S))
