@@ -67,10 +67,20 @@ cdef struct Channel:  # an encoder, in Nm of torsion
     double off  # displacement that no motion explains
     double unseen  # while it stands still: motion that the velocity has
 
+cdef struct Range:  # of the last RANGE_S
+    double high, low
+
+cdef struct Slip:  # motion of the motor's position beyond its velocity
+    double lag, scale  # samples by which the velocity is behind; by how much its scale is wrong
+    double by_change, changes, by_step, steps, both  # sums of products that they are of [Nm^2]
+    double sum, usual  # [Nm]; square of its healthy range
+    Range range, velocity
+
 cdef struct InputState:
     Channel motor, link
     double velocity, current  # last step by the drive's velocity [Nm]; current [A]
-    double doubt  # [Nm]
+    Slip slip
+    double dt, doubt  # of the last sample [s]; [Nm]
     double strange  # samples out of order lately
     double still_nm  # current [Nm] when the link's reading began to stand still
     Runs runs, link_runs  # of samples that are equal as a whole, and of equal readings of the link

@@ -29,7 +29,7 @@ cdef struct MeasuredBlock:  # a `Measured`
     double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, sensor_nm, temperature_c
 
 cdef enum:
-    STATE_WORDS = 304  # room for the state of an estimator
+    STATE_WORDS = 320  # room for the state of an estimator
 
 cdef struct LearnedBlock:  # `LEARNED`: zeros, and the estimator's state after the cycle of the last estimate
     Learned zeros

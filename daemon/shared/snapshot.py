@@ -182,7 +182,7 @@ JOINT = struct.Struct("<6dHBBHH4dII")
 ESTIMATE = struct.Struct(f"<qQqq{MOST_JOINTS}q")
 MEASURED = struct.Struct("<6d")
 INPUT = struct.Struct("<12q")  # an `InputView`
-PAST_WORDS = 304  # room for the state of an estimator
+PAST_WORDS = 320  # room for the state of an estimator
 LEARNED = struct.Struct(f"<7d3Q{8 * PAST_WORDS}s")
 """`Zeros`, length of the state [byte], the state."""
 ESTIMATE_SIZE = ESTIMATE.size + MOST_JOINTS * (JOINT.size + MEASURED.size)

@@ -200,6 +200,59 @@ def moving() -> Inputs:
     return Inputs(*map(np.asarray, columns), made.joint_torque_nm[:, 0])
 
 
+FAULTY = slice(4000, 4500)
+"""Of `moving`: the joint is fast, turns back and is fast again."""
+
+
+def _lost(angle: FloatArray, part: float) -> FloatArray:
+    return part * (angle - angle[0])
+
+
+MISLED: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "counts are lost": lambda angle: _lost(angle, -0.02),
+    "counts are lost one way": lambda angle: (
+        -0.3 * np.cumsum(np.maximum(np.diff(angle, prepend=angle[0]), 0.0))
+    ),
+    "a bit is stuck": lambda angle: 0.02 * (np.arange(len(angle)) // 3 % 2),
+    "eccentric": lambda angle: 0.03 * (np.sin(2.0 * angle) - np.sin(2.0 * angle[0])),
+    "held for five cycles": lambda angle: angle[np.arange(len(angle)) // 5 * 5] - angle,
+    "twelve cycles old": lambda angle: (
+        np.interp(np.arange(len(angle)) - 12, np.arange(len(angle)), angle) - angle
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISLED)
+def test_a_motor_position_that_leaves_its_velocity_widens_sigma(name: str) -> None:
+    """Each of its steps is in order; what they sum up to in a tenth of a second is not."""
+    given = moving()
+    motor = given.motor_rad.copy()
+    motor[FAULTY] += MISLED[name](motor[FAULTY])
+    found = estimated(given._replace(motor_rad=motor))
+    error = np.abs(found.torque_nm - given.true_nm)[FAULTY]
+    assert not np.any((error > 2.0) & (error > 4.0 * found.sigma_nm[FAULTY]))
+
+
+def test_a_wrong_velocity_is_forgotten_within_half_a_second() -> None:
+    given = moving()
+    velocity = given.motor_rad_s.copy()
+    velocity[FAULTY] *= -1.0
+    found, healthy = estimated(given._replace(motor_rad_s=velocity)), estimated(given)
+    assert np.median(found.sigma_nm[FAULTY][50:]) > 4.0 * np.median(healthy.sigma_nm[2000:])
+    assert np.max(found.sigma_nm[5000:] - healthy.sigma_nm[5000:]) < 0.05 * RATED
+
+
+@pytest.mark.parametrize("cycles", [1, 4])
+@pytest.mark.parametrize("scale", [1.0, 0.97])
+def test_the_filter_and_the_scale_of_a_drives_velocity_are_learned(cycles: int, scale: float) -> None:
+    """The mean of some cycles, and another scale: sigma is that of the velocity itself."""
+    given = moving()
+    mean = np.convolve(given.motor_rad_s, np.full(cycles, scale / cycles))[: len(given.motor_rad_s)]
+    found, exact = estimated(given._replace(motor_rad_s=mean)), estimated(given)
+    assert np.median(found.sigma_nm[2000:]) < 1.2 * np.median(exact.sigma_nm[2000:])
+    assert np.mean(found.status[2000:] == st.VALID) > 0.95 * np.mean(exact.status[2000:] == st.VALID)
+
+
 @pytest.mark.parametrize("error_rad", [2e-4, -3e-4])
 @pytest.mark.parametrize("cycles", [500, 2000])
 def test_nothing_is_learned_from_a_fault(error_rad: float, cycles: int) -> None:

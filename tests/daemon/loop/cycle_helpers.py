@@ -135,13 +135,19 @@ def inputs(
     ]
 
 
+def _turned(sync: int, more: int, cycles: int) -> int:
+    """Return the sum up to `sync` of a tenth of 4000 + more (n % cycles)."""
+    saws, rest = divmod(sync, cycles)
+    return 400 * sync + more * (saws * cycles * (cycles - 1) + rest * (rest + 1)) // 20
+
+
 def moving(sync: int) -> list[bytes]:
     """Both joints turn at about 4 rad/s of the motor, every cycle is different; inputs are missing now and then."""
-    turned = 400 * sync
+    one, two = _turned(sync, 7, 300), _turned(sync, 5, 200)
     frames = [
-        frame(0x181, I32.pack(turned, turned // 10)),
+        frame(0x181, I32.pack(one, one // 10)),
         frame(0x281, MOTION.pack(4000 + 7 * (sync % 300), 100 + sync % 97, ENABLED)),
-        frame(0x182, I32.pack(-turned, -turned // 10)),
+        frame(0x182, I32.pack(-two, -two // 10)),
         frame(0x282, MOTION.pack(-4000 - 5 * (sync % 200), 90 - sync % 61, ENABLED)),
         frame(0x183, SENSOR.pack(9000 + sync, 0)),
     ]
