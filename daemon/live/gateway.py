@@ -21,7 +21,12 @@ _END = b"\r\n\r\n"
 _LONGEST_HANDSHAKE = 16_384
 _HANDSHAKE_S = 5.0
 _CHUNK = 65_536
-_MOST_PAGES = 32
+_MOST = 32
+"""Pages, and viewers as many."""
+_MOST_BRIEF = 64
+"""Connections that have not asked yet, or not taken their answer: one more costs the oldest of them its place. A page is one
+open file, a viewer three: all stay far below the 1024 of a service."""
+_ACCEPTED_AT_ONCE = 32
 _UNSENT = 262_144
 """Bytes waiting for a page that does not read, some 10 s; what comes then is not for it."""
 
@@ -42,8 +47,12 @@ class Gateway:
         self._loop = asyncio.new_event_loop()
         self._tasks: set[asyncio.Task[None]] = set()
         self._pages: set[asyncio.StreamWriter] = set()
+        self._brief: dict[asyncio.StreamWriter, None] = {}  # in the order in which they came
+        self._viewers: set[asyncio.StreamWriter] = set()
         try:
-            listening = asyncio.start_server(self._serve, *address, limit=_LONGEST_HANDSHAKE)
+            listening = asyncio.start_server(
+                self._serve, *address, limit=_LONGEST_HANDSHAKE, backlog=_ACCEPTED_AT_ONCE
+            )
             self._server = self._loop.run_until_complete(listening)
         except BaseException:
             self._loop.close()
@@ -83,55 +92,80 @@ class Gateway:
         task = asyncio.current_task()
         assert task is not None
         self._tasks.add(task)
+        self._brief[writer] = None
+        if len(self._brief) > _MOST_BRIEF:
+            oldest = next(iter(self._brief))
+            del self._brief[oldest]
+            oldest.transport.abort()
         try:
-            with suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, TimeoutError):
+            with suppress(OSError, asyncio.IncompleteReadError, TimeoutError):
                 await self._connect(reader, writer)
         except asyncio.CancelledError:
             pass  # stopped
         finally:
             self._tasks.discard(task)
+            self._brief.pop(writer, None)
+            self._viewers.discard(writer)
             writer.close()
+            self._loop.call_later(_HANDSHAKE_S, writer.transport.abort)  # what nobody takes is not kept
 
     async def _connect(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        head = await asyncio.wait_for(reader.readuntil(_END), _HANDSHAKE_S)
+        answer: bytes | None
         try:
+            head = await asyncio.wait_for(reader.readuntil(_END), _HANDSHAKE_S)
             request = web.request_of(head)
+        except asyncio.LimitOverrunError:
+            why = f"a request may have {_LONGEST_HANDSHAKE} bytes; cookies of localhost count"
+            answer = web.text_answer(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, why)
         except ValueError as error:
-            answer: bytes | None = web.text_answer(HTTPStatus.BAD_REQUEST, str(error))
+            answer = web.text_answer(HTTPStatus.BAD_REQUEST, str(error))
         else:
-            if (protocols := request.protocols) and not web.obstacle(request, self._names):
-                if self._inner is not None and (PROTOCOL in protocols or OLDER in protocols):
-                    await self._pass_on(head, PROTOCOL in protocols, reader, writer)
+            protocols = [] if web.obstacle(request, self._names) else request.protocols
+            if self._inner is not None and (PROTOCOL in protocols or OLDER in protocols):
+                answer = await self._pass_on(head, PROTOCOL in protocols, reader, writer)
+                if answer is None:
                     return
+            elif protocols:
                 known = f"websocket subprotocols: {PROTOCOL}, {OLDER}" if self._inner else NEEDED
                 answer = web.text_answer(HTTPStatus.BAD_REQUEST, known)
             else:
                 answer = web.answer(request, self._names)
-        if answer is None and len(self._pages) >= _MOST_PAGES:
-            answer = web.text_answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{_MOST_PAGES} pages are open")
-        writer.write(web.STREAM_HEAD if answer is None else answer)
-        await writer.drain()
+        if answer is None and len(self._pages) >= _MOST:
+            answer = web.text_answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{_MOST} pages are open")
         if answer is None:
+            writer.write(web.STREAM_HEAD)
             await self._stream(reader, writer)
+        else:
+            writer.write(answer)
+            writer.write_eof()
+            await asyncio.wait_for(_drop(reader), _HANDSHAKE_S)
 
     async def _stream(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Let `publish` write until the browser leaves; what it sends is dropped."""
+        self._brief.pop(writer, None)
         self._pages.add(writer)
         try:
-            while await reader.read(_CHUNK):
-                pass
+            await _drop(reader)
         finally:
             self._pages.discard(writer)
             writer.transport.abort()  # what a page did not read is not waited for
 
     async def _pass_on(
         self, head: bytes, newest: bool, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> None:
+    ) -> bytes | None:
+        """Connect a viewer until it leaves; return the answer to one that is refused."""
         assert self._inner is not None
+        if len(self._viewers) >= _MOST:
+            return web.text_answer(HTTPStatus.SERVICE_UNAVAILABLE, f"{_MOST} viewers are connected")
+        self._viewers.add(writer)
         inside, outside = await asyncio.open_connection(*self._inner, limit=_LONGEST_HANDSHAKE)
         try:
             outside.write(renamed(head, PROTOCOL))
-            answer = await asyncio.wait_for(inside.readuntil(_END), _HANDSHAKE_S)
+            try:
+                answer = await asyncio.wait_for(inside.readuntil(_END), _HANDSHAKE_S)
+            except asyncio.IncompleteReadError:
+                return web.text_answer(HTTPStatus.BAD_REQUEST, "expected the handshake of a websocket")
+            self._brief.pop(writer, None)
             writer.write(answer if newest else renamed(answer, OLDER))
             pumps = [asyncio.ensure_future(_pump(*ends)) for ends in ((reader, outside), (inside, writer))]
             try:
@@ -142,6 +176,13 @@ class Gateway:
                 await asyncio.gather(*pumps, return_exceptions=True)
         finally:
             outside.close()
+        return None
+
+
+async def _drop(source: asyncio.StreamReader) -> None:
+    """Read until the other side ends: a connection closed on unread bytes loses what it has sent."""
+    while await source.read(_CHUNK):
+        pass
 
 
 async def _pump(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:

@@ -37,6 +37,7 @@ _ALWAYS: Final = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
+_END: Final = b"\r\n\r\n"
 _PROTOCOL: Final = "sec-websocket-protocol"
 
 
@@ -49,8 +50,9 @@ class Request(NamedTuple):
 
     @property
     def protocols(self) -> list[str]:
-        """Return the websocket subprotocols that it offers."""
-        values = self.headers.get(_PROTOCOL, [])
+        """Return the websocket subprotocols that it offers; none where it asks for no websocket."""
+        asks = self.method == "GET" and "websocket" in map(str.lower, self.headers.get("upgrade", []))
+        values = self.headers.get(_PROTOCOL, []) if asks else []
         return [each.strip() for value in values for each in value.split(",")]
 
 
@@ -105,18 +107,24 @@ def _is_local(host: str, names: frozenset[str]) -> bool:
 
 def answer(request: Request, names: frozenset[str]) -> bytes | None:
     """Return the whole answer to a request without a websocket; None for the stream, which goes on behind `STREAM_HEAD`."""
+    whole = _answer_to_get(request, names)
+    if request.method != "HEAD":
+        return whole
+    return STREAM_HEAD if whole is None else whole[: whole.index(_END) + len(_END)]
+
+
+def _answer_to_get(request: Request, names: frozenset[str]) -> bytes | None:
     if why := obstacle(request, names):
         return text_answer(HTTPStatus.FORBIDDEN, why)
     if request.method not in ("GET", "HEAD"):
         return text_answer(HTTPStatus.METHOD_NOT_ALLOWED, "read-only: GET and HEAD", {"Allow": "GET, HEAD"})
     if request.path == STREAM:
-        return None if request.method == "GET" else STREAM_HEAD
+        return None
     if request.path not in _FILES:
         return text_answer(HTTPStatus.NOT_FOUND, f"nothing at {request.path[:80]!r}")
     name, kind = _FILES[request.path]
     body = (_PAGE / name).read_bytes()
-    head = _head(HTTPStatus.OK, {"Content-Type": kind, "Content-Length": str(len(body))})
-    return head if request.method == "HEAD" else head + body
+    return _head(HTTPStatus.OK, {"Content-Type": kind, "Content-Length": str(len(body))}) + body
 
 
 def text_answer(status: HTTPStatus, text: str, headers: dict[str, str] | None = None) -> bytes:

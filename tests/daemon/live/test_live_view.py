@@ -187,7 +187,7 @@ def test_viewers_of_both_protocols_are_served(shared, offered, chosen):
 
 
 def test_a_client_of_another_protocol_is_answered_what_to_use(shared):
-    answer = asked(shared[1].port, "/", "Sec-WebSocket-Protocol: chat")
+    answer = asked(shared[1].port, "/", "Upgrade: websocket", "Sec-WebSocket-Protocol: chat")
     assert answer.startswith(b"HTTP/1.1 400 ")
     for word in (PROTOCOL, OLDER):
         assert word.encode() in answer

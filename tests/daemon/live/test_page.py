@@ -1,6 +1,7 @@
 """The page in the browser: numbers of the log, who may ask, pages that do not read, and what Chromium draws."""
 
 import json
+import resource
 import select
 import socket
 import threading
@@ -92,6 +93,13 @@ class Running:
     def __exit__(self, *_):
         self._stop.set()
         self._thread.join()
+
+
+def answered(port, data):
+    """The whole answer to these bytes."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
+        client.sendall(data)
+        return b"".join(iter(lambda: client.recv(65_536), b""))
 
 
 @pytest.fixture(scope="module")
@@ -275,6 +283,7 @@ def test_hosts_and_origins_of_others_get_nothing(headers):
         ("GET", "/uplot/../../../jtqd.py", 404),
         ("GET", "/%2e%2e/web.py", 404),
         ("GET", "/page", 404),
+        ("HEAD", "/page", 404),
     ],
 )
 def test_what_is_answered(method, path, status):
@@ -312,9 +321,28 @@ def test_over_the_socket_the_same_refusals(live):
     upgrade = "Sec-WebSocket-Protocol: foxglove.sdk.v1", "Upgrade: websocket", "Connection: Upgrade"
     assert status_of(asked(live.port, "/", *upgrade, host="evil.example")) == 403
     assert status_of(asked(live.port, "/", method="PUT")) == 405
-    with socket.create_connection(("127.0.0.1", live.port), timeout=10) as client:
-        client.sendall(b"\x16\x03\x01\r\n\r\n")
-        assert status_of(client.recv(4096)) == 400
+    assert status_of(answered(live.port, b"\x16\x03\x01\r\n\r\n")) == 400
+
+
+def test_what_it_does_not_read_is_answered_too(live):
+    assert status_of(answered(live.port, head(f"Cookie: {'x' * 20_000}", "Host: localhost"))) == 431
+    long = head("Host: localhost", "Content-Length: 4000000", method="POST") + bytes(4_000_000)
+    assert status_of(answered(live.port, long)) == 405
+    no_key = "Upgrade: websocket", "Sec-WebSocket-Protocol: foxglove.sdk.v1"
+    assert status_of(answered(live.port, head("Host: localhost", *no_key))) == 400
+    assert status_of(answered(live.port, head("Host: localhost", no_key[1]))) == 200
+
+
+def test_connections_that_do_not_ask_take_no_place_of_those_that_do(tmp_path):
+    """With as many as it may have open files; a traceback fails the process."""
+    with Running(tmp_path) as running, LiveProcess(running.directory, shadow=True) as served:
+        resource.prlimit(served.process.pid, resource.RLIMIT_NOFILE, (256, 256))
+        silent = [socket.create_connection(("127.0.0.1", served.port), timeout=10) for _ in range(400)]
+        assert status_of(asked(served.port, "/")) == 200
+        assert len(list(Path(f"/proc/{served.process.pid}/fd").iterdir())) < 200
+        for each in silent:
+            each.close()
+    assert "Too many open files" not in served.errors
 
 
 def test_the_page_is_small_comes_from_here_alone_and_states_so(live):
@@ -388,7 +416,7 @@ def test_without_foxglove_there_is_the_page_and_what_to_install(tmp_path, monkey
     thread.start()
     try:
         assert status_of(asked(port, "/")) == 200
-        answer = asked(port, "/", "Sec-WebSocket-Protocol: foxglove.sdk.v1")
+        answer = asked(port, "/", "Upgrade: websocket", "Sec-WebSocket-Protocol: foxglove.sdk.v1")
         assert status_of(answer) == 400
         assert b"jtqd[live]" in answer
         running.cycle()
