@@ -129,10 +129,8 @@ def steps_of(x: FloatArray) -> FloatArray:
     out, step = np.zeros(len(x)), 0.0
     decade = np.floor(np.log10(np.maximum(np.abs(x), 1e-30)))
     for there in (decade == e for e in np.unique(decade)):
-        values = np.unique(x[there])
-        if len(values) > min(
-            _SHOWN, max(2, there.sum() // 2)
-        ):  # at rest or commanded they show none, and have the last
+        values, enough = np.unique(x[there]), min(_SHOWN, max(2, there.sum() // 2))
+        if len(values) > enough:  # else at rest or commanded: they have that of the decade before
             step = _decimal(values, float(np.max(np.abs(values))))
         out[there] = step
     short = np.abs(x).astype(np.float32)
