@@ -350,7 +350,7 @@ cdef double SHRUNK_BELOW = 2.0, KEPT_ABOVE = 4.0, INVERSE_RANGE = 1.0 / (KEPT_AB
 # the file's sigma needs no correction
 cdef double COVERED = 0.5
 cdef double SLEW_S = 0.25, INVERSE_SLEW = 1.0 / SLEW_S
-cdef double CALM_S = 1.0, AGAIN_S = 0.5  # of paths that agree by what was learned; that agree by what was kept alone; after faults sigma is 0.1 to 0.2 Nm less with each
+cdef double CALM_S = 1.0, AGAIN_S = 0.5  # of paths that agree by what was learned; that agree by what was kept alone; after faults sigma is 0.06 to 0.2 Nm less with each
 cdef double LARGEST_LINK = 0.3  # prior standard deviation of the link offset as a torque, part of the rated torque
 cdef double CURRENT_SHARE = 0.2  # of the current offset as a torque, part of the current path's: the rest is friction
 cdef double LEAST_GAIN = 0.03  # least one of the gain
