@@ -17,9 +17,22 @@ from jtqd.estimator.text import printable
 
 def command_parser(prog: str, description: str, examples: str) -> argparse.ArgumentParser:
     """Return a parser without arguments; examples: epilog of its help, printed line by line."""
-    return argparse.ArgumentParser(
-        prog=prog, description=description, epilog=examples, formatter_class=HelpFormatter
-    )
+    return _Parser(prog=prog, description=description, epilog=examples, formatter_class=HelpFormatter)
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser, as those of its subcommands, whose `type=Path` refuses an empty name: Path would take it for here."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.register("type", Path, file_name)
+
+
+def file_name(text: str) -> Path:
+    """Return the path of a file or directory. Raises argparse.ArgumentTypeError for an empty one."""
+    if not text:
+        raise argparse.ArgumentTypeError("found '', expected the name of a file or directory")
+    return Path(text)
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):

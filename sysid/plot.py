@@ -13,7 +13,7 @@ import numpy as np
 
 from jtqd.daemon.logs import LogError, Records, read_topic, rmse, shadow_errors, topics_of
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.command_line import check_installed
+from jtqd.estimator.command_line import check_installed, command_parser
 from jtqd.estimator.files import whole_file
 from jtqd.estimator.observer import reference_of
 from jtqd.estimator.settings import METHODS, EstimatorSettings
@@ -50,10 +50,10 @@ CONTACT_KNOWN, CONTACT = 64, 128
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq plot`."""
-    parser = argparse.ArgumentParser(
-        prog="jtq plot",
-        description="Draw the estimate of one joint and the torque sensor, as old as it, from a log of jtqd.",
-        epilog="example: jtq plot logs/jtqd-sim-20261121T080000Z.mcap --joint 1 --out joint1.png",
+    parser = command_parser(
+        "jtq plot",
+        "Draw the estimate of one joint and the torque sensor, as old as it, from a log of jtqd.",
+        "example: jtq plot logs/jtqd-sim-20261121T080000Z.mcap --joint 1 --out joint1.png",
     )
     parser.add_argument("log", type=Path, help="MCAP file of jtqd")
     parser.add_argument(

@@ -35,11 +35,9 @@ def joint_files(arguments: Sequence[str], columns: ColumnMap | None) -> dict[int
     files: dict[int, Path] = {}
     for text in arguments:
         match = _JOINT.fullmatch(text)
-        name, equals, path = text.partition("=")
-        if not match and equals and "/" not in name and not Path(text).exists():
-            raise UsageError(
-                f"--joint {text}: found joint {name!r}, expected a number from 1 to 7 in N={path or 'FILE'}"
-            )
+        name, equals, _ = text.partition("=")
+        if not match and (not text or (equals and "/" not in name and not Path(text).exists())):
+            raise UsageError(f"--joint {text!r}: expected FILE, or N=FILE with N from 1 to 7")
         number = int(match.group(1)) if match else ALL_JOINTS
         if number in files:
             which = "for all joints" if number == ALL_JOINTS else f"of joint {number}"

@@ -74,26 +74,36 @@ def test_no_help_loads_a_large_library():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def _helps(parser):
-    """Help of a parser and of all below it."""
-    yield parser.prog, parser.format_help()
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for below in action.choices.values():
-                yield from _helps(below)
+def _parsers():
+    """The parsers of all commands, and of all below them."""
+    modules = [module for module, _ in jtq.COMMANDS.values()] + [*jtq.FORMS.values()]
+    waiting = [daemon.parser(), *(importlib.import_module(module).parser() for module in modules)]
+    for parser in waiting:
+        yield parser
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                waiting += action.choices.values()
 
 
 def test_no_help_is_wider_than_a_terminal(monkeypatch):
     """Of 80 columns, which nobody has drawn larger; the lines of examples too."""
     columns = 80
     monkeypatch.setenv("COLUMNS", str(columns))
-    modules = [module for module, _ in jtq.COMMANDS.values()] + [*jtq.FORMS.values()]
-    parsers = [importlib.import_module(module).parser() for module in modules]
-    helps = [one for each in (*parsers, daemon.parser()) for one in _helps(each)]
-    assert len(helps) > len(modules) + 5, "subcommands are among them"
+    helps = [(parser.prog, parser.format_help()) for parser in _parsers()]
+    assert len(helps) > len(jtq.COMMANDS) + 5, "subcommands are among them"
     wide = [f"{prog}: {line}" for prog, text in helps for line in text.splitlines() if len(line) > columns]
     assert wide == []
     assert max(map(len, jtq._help().splitlines())) <= columns
+
+
+def test_no_command_takes_an_empty_name_for_the_directory_it_is_in():
+    """What `--out "$OUT"` gives where OUT is not set."""
+    files = [(each, action) for each in _parsers() for action in each._actions if action.type is Path]
+    assert len(files) > 40
+    for each, action in files:
+        with pytest.raises(argparse.ArgumentError):
+            print(each.prog, action.dest, each._get_value(action, ""))
+        assert each._get_value(action, "a/b") == Path("a/b")
 
 
 def test_a_command_that_goes_on_below_is_still_one_command():

@@ -357,7 +357,9 @@ def test_a_task_that_takes_too_long_is_a_failed_one(tmp_path):
     [
         (["diagnose", "nowhere", "--joint", str(JOINT_FILE)], (1, "nowhere: found no such file or directory")),
         (["diagnose", "logs"], (2, "--joint")),
-        (["diagnose", "logs", "--joint", "x=a.yaml"], (2, "found joint 'x', expected a number from 1 to 7")),
+        (["diagnose", "logs", "--joint", ""], (2, "N from 1 to 7")),
+        (["diagnose", "logs", "--joint", "1="], (2, "N from 1 to 7")),
+        (["diagnose", "logs", "--joint", "x=a.yaml"], (2, "N from 1 to 7")),
         (["replay", "nothere.mcap"], (1, "nothere.mcap: found no such file or directory")),
         (["diagnose", "logs", "--joint", "none.yaml"], (1, "none.yaml: cannot be read: No such file")),
         (["replay", "logs", "--out", "logs/a.mcap"], (1, "--out logs/a.mcap: cannot be created: it is a file")),
