@@ -226,7 +226,7 @@ def _text(path: Path, data: bytes) -> str:
         raise RunError(f"{path}: found a broken gzip stream ({error}), expected gzipped CSV") from None
     except UnicodeDecodeError as error:
         raise RunError(f"{path}: found byte {error.start} that is not UTF-8, expected UTF-8 text") from None
-    if not text.strip():
+    if not text.strip().strip("\0"):  # zeros: what a recorder without power has left
         raise RunError(f"{path}: found an empty file, expected a header row and samples")
     return text
 

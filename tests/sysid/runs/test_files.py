@@ -121,6 +121,7 @@ def test_wrong_maps_are_named(mapping, expected):
         ("time_s,j1.current_a\n0,1\n\n2,2\n1,3\n", "line 5: found time 1 s after 2 s"),
         ("time_s,j1.current_a\n0,1\n1,2\n2,3\n20,3\n21,3\n22,3\n", "line 5: found a gap of 18 s"),
         (b"time_s,j1.current_a\n0,\xff\n1,2\n", "byte 22 that is not UTF-8"),
+        (bytes(4096), "an empty file"),
         ('time_s,j1.current_a\n0,"1\n1,2\n', "found"),
     ],
 )
