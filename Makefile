@@ -26,7 +26,7 @@ hidden-effect: $(VENV)/.installed-analysis ## hide an effect in the emulated ben
 test: style ## everything but the tests marked campaign
 	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part. pytest compiles its test_*.py.
 	$(BIN)/python -m compileall -q -j 0 -x '/test_[^/]*$$' daemon drivers estimator models sim_can sysid tests tools validation
-	@$(MAKE) --no-print-directory -k -j2 --output-sync=target test-native test-guest test-hidden test-sysid test-here types
+	@$(MAKE) --no-print-directory -k -j2 --output-sync=target test-native test-guest test-hidden test-here test-sysid types
 
 # Two lanes at once, in this order. The native one sleeps for most of its time, and beside it runs one that only takes the
 # turns that nobody else wants: beside two, processes came late. The bench kernel keeps a time of its own.
