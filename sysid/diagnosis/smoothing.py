@@ -88,7 +88,7 @@ _SAME: Final = 1e-8
 _DIGITS: Final = 9
 """Significant digits from which a decimal is as good as none."""
 _ON_GRID: Final = 0.95
-"""Part of the small distances between values that are whole multiples of the least, on a grid."""
+"""Part of the distances between values that are whole steps, on a grid."""
 _COARSE: Final = 0.25
 """Part of a grid's step to which a distance must be known, to show it."""
 _FEW: Final = 12
