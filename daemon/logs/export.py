@@ -11,7 +11,6 @@ import csv
 import gzip
 import io
 import json
-import math
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -37,6 +36,7 @@ from jtqd.daemon.logs.read import (
     read_attachments,
     topics_of,
 )
+from jtqd.daemon.logs.table import Columns, flat_columns
 from jtqd.daemon.recording.messages import JOINTS
 from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.files import whole_file
@@ -240,9 +240,6 @@ def candump_line(frame: Sequence[Any], interface: str) -> str:
 # ---- tables ----
 
 
-Columns = dict[str, NDArray[Any]]
-"""Name -> values, all of one length."""
-
 RUN_FIELDS = {
     "current_a": "current_a",
     "motor_position_rad": "motor_position_rad",
@@ -400,13 +397,13 @@ def topic_blocks(
         if messages.records.dtype != object:  # a schema with fixed rows has no sequence
             break
         blocks += 1
-        for name, values in _flat(messages.records).items():
+        for name, values in flat_columns(messages.records).items():
             kinds.setdefault(name, []).append(values.dtype)
     absent = [np.dtype(float)]
     kind = {name: np.result_type(*each, *absent * (len(each) < blocks)) for name, each in kinds.items()}
     found = False
     for messages in iter_messages(path, topic, start_ns=start_ns, end_ns=end_ns):
-        columns = _flat(messages.records)
+        columns = flat_columns(messages.records)
         for name, each in kind.items():
             if name not in columns:
                 columns[name] = np.full(len(messages.records), "" if each.kind == "O" else np.nan, each)
@@ -415,61 +412,6 @@ def topic_blocks(
         yield {"log_time_ns": messages.log_times, **{name: columns[name] for name in kind or columns}}
     if not found:
         raise LogError(f"{_named(path)}: found no message on {topic}{_when(span)}, expected one at least")
-
-
-_LONGEST = 256
-
-
-def _flat(records: Records) -> Columns:
-    """Return the fields of messages as columns."""
-    columns: Columns = {}
-    if records.dtype == object:
-        _flatten_objects("", records.tolist(), columns)
-    else:
-        _flatten("", records, columns)
-    return columns
-
-
-def _flatten(prefix: str, values: NDArray[Any], columns: Columns) -> None:
-    """Put the fields below `prefix` into columns."""
-    kind = values.dtype
-    if kind.names is not None:
-        for name in kind.names:
-            _flatten(f"{prefix}.{name}".lstrip("."), values[name], columns)
-    elif values.ndim > 1:
-        for n in range(values.shape[1]):
-            _flatten(f"{prefix}[{n}]", values[:, n], columns)
-    elif kind.kind == "S":
-        columns[prefix] = np.array([each.decode("utf-8", "replace") for each in values.tolist()], object)
-    else:
-        columns[prefix] = values
-
-
-def _flatten_objects(prefix: str, values: list[Any], columns: Columns) -> None:
-    """Put the attributes of the decoder's objects into columns as `_flatten` does; None: an element that is not there."""
-    one: Any = next((each for each in values if each is not None), None)
-    if hasattr(one, "__slots__"):
-        for name in one.__slots__:
-            inner = [getattr(each, name, None) for each in values]
-            _flatten_objects(f"{prefix}.{name}".lstrip("."), inner, columns)
-    elif isinstance(one, Sequence) and not isinstance(one, str):
-        rows: list[Any] = [() if each is None else each for each in values]
-        longest = max(map(len, rows))
-        element: Any = next((row[0] for row in rows if len(row)), None)
-        if hasattr(element, "__slots__"):
-            for name in element.__slots__:
-                inner = [[getattr(each, name) for each in row] for row in rows]
-                _flatten_objects(f"{prefix}.{name}", inner, columns)
-        elif longest > _LONGEST:
-            columns[prefix] = np.array([" ".join(map(str, row)) for row in rows], object)
-        else:
-            for n in range(longest):
-                inner = [row[n] if n < len(row) else None for row in rows]
-                _flatten_objects(f"{prefix}[{n}]", inner, columns)
-    elif isinstance(one, int | float):
-        columns[prefix] = np.array([math.nan if each is None else each for each in values])
-    else:
-        columns[prefix] = np.array(["" if each is None else str(each) for each in values], object)
 
 
 # ---- files ----

@@ -25,11 +25,9 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.files import write_whole
 from jtqd.estimator.joint import Effect, Joint
-from jtqd.estimator.run import RunTable, RunTableError
-from jtqd.estimator.text import counted
+from jtqd.estimator.run import RunTableError
 from jtqd.sysid.diagnosis.findings import (
     EVERYTHING,
-    INSUFFICIENT,
     NO_GAP,
     SENSOR,
     Cause,
@@ -41,13 +39,13 @@ from jtqd.sysid.diagnosis.findings import (
     to_mapping,
 )
 from jtqd.sysid.diagnosis.limits import PRIORS, RELEVANCE
+from jtqd.sysid.diagnosis.run_files import findings_of, majority
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.planner.campaigns import beyond_file, parsed_limits, with_limits
 from jtqd.sysid.planner.plan import Plan
-from jtqd.sysid.progress import waiting
-from jtqd.sysid.runs.checks import CheckedRuns, check_runs, may_leave_out
+from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import LEFT_OUT, read_runs
+from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.options import (
     UsageError,
     add_columns,
@@ -69,8 +67,6 @@ _DIGITS: Final = 7
 _OWN: Final = (FINDINGS, REPORT, "extended.joint*.yaml", "next_experiment.*")
 """All names that a diagnosis may write."""
 _ITEM: Final = re.compile(r"(?:(?P<where>[1-7]|sensor)=)?(?P<name>[a-z_]+)")
-_PIECE: Final = re.compile(r" \(\d+ of \d+\)$")
-_FIGURES: Final = re.compile(r"(?<![\w.])[-+]?\d[\d.e+-]*")
 _SIZE: Final = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?) *(%|[a-zµ]+)", re.IGNORECASE)
 """A size with its unit: "1 %", "3 ms"."""
 
@@ -172,78 +168,14 @@ def diagnosed(
     relevance: float = RELEVANCE,
     trust: Mapping[str, float] = MappingProxyType({}),
 ) -> Findings:
-    """Check the channels and diagnose what may be used; the findings list what may not. relevance, trust: see `diagnose`.
-
-    No gap in the other joints is no proof for a joint that could not be judged.
-    """
+    """Check the channels and diagnose what may be used; the findings list what may not. relevance, trust: see `diagnose`."""
     checked = majority(
         check_runs([(run.name, run.table) for run in runs], joints, scope.known_references), runs
     )
-    findings = _diagnosed(runs, joints, checked, scope, relevance, trust)
+    findings = findings_of(runs, joints, checked, scope, relevance, trust)
     for line in (*checked.refused, *checked.notes):
         if line not in findings.reasons:  # which the summary has
             print(f"{BY}: {line}", file=sys.stderr)
-    return findings
-
-
-def majority(checked: CheckedRuns, runs: Sequence[RunFile]) -> CheckedRuns:
-    """Return what may be used without the joints of which too many recordings are left out, and one line for all runs with
-    the same fault: a joint is not judged by the few recordings in which a wrong load or column does not show.
-    """
-    same: dict[str, list[tuple[str, str]]] = {}
-    for line in checked.refused:
-        name = next((run.name for run in runs if line.startswith(f"{run.name}: ")), "")
-        same.setdefault(_FIGURES.sub("", line.removeprefix(name)), []).append((name, line))
-    refused = []
-    for found in same.values():
-        more = (
-            f" (the same in {len(found)} runs: {', '.join(name for name, _ in found)})" if found[1:] else ""
-        )
-        refused.append(f"{found[0][1]}{more}")
-    lacking = sum(note.startswith(LEFT_OUT) for run in runs for note in run.notes)
-    minority: list[str] = []
-    lost, usable = list(checked.lost), list(checked.runs)
-    for number in sorted({n for _, table in usable for n in table.joints}):
-        given = {_PIECE.sub("", run.name) for run in runs if number in run.table.joints}
-        used = {_PIECE.sub("", name) for name, table in usable if number in table.joints}
-        out, of = len(given - used) + lacking, len(given) + lacking
-        if may_leave_out(out, of):
-            continue
-        text = f"found {out} of {of} recordings that cannot be used, expected fewer than half"
-        minority.append(f"joint {number}: {text}: what is wrong there may be wrong in all")
-        lost.append(number)
-        rest = [(name, t.time_s, {n: c for n, c in t.joints.items() if n != number}) for name, t in usable]
-        usable = [(name, RunTable(time_s, joints)) for name, time_s, joints in rest if joints]
-    return replace(checked, runs=tuple(usable), refused=(*minority, *refused), lost=tuple(sorted(lost)))
-
-
-def _diagnosed(  # noqa: PLR0917
-    runs: Sequence[RunFile],
-    joints: Mapping[int, Joint],
-    checked: CheckedRuns,
-    scope: Scope,
-    relevance: float,
-    trust: Mapping[str, float],
-) -> Findings:
-    reader = [f"{run.name}: {note}" for run in runs for note in run.notes]
-    notes = (*checked.refused, *checked.notes, *reader)
-    if not checked.runs:
-        reasons = checked.refused or ("found no run with columns of a joint to diagnose",)
-        names = tuple(run.name for run in runs)
-        return Findings(INSUFFICIENT, reasons, names, tuple(joints), channel_notes=notes)
-    with waiting(f"diagnosing {counted(len(checked.runs), 'run')}"):
-        from jtqd.sysid.diagnosis.diagnose import diagnose
-
-        left = {number: joint for number, joint in joints.items() if number not in checked.lost}
-        findings = diagnose(checked.runs, left, scope, relevance=relevance, trust=trust)
-    findings = replace(findings, channel_notes=notes + findings.channel_notes)
-    if findings.verdict == NO_GAP and checked.lost:
-        one = len(checked.lost) == 1
-        lost = f"joint{'' if one else 's'} {', '.join(map(str, checked.lost))}"
-        reason = f"{lost}: no run of {'it' if one else 'them'} can be used, the others have no gap"
-        return replace(findings, verdict=INSUFFICIENT, reasons=(reason, *checked.refused))
-    if findings.verdict == INSUFFICIENT:
-        return replace(findings, reasons=(*findings.reasons, *checked.refused))
     return findings
 
 
