@@ -28,10 +28,10 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable, RunTableError
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.diagnosis.command import diagnosed
 from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Trace, to_mapping
 from jtqd.sysid.diagnosis.regressors import bin_samples, binned, run_data
+from jtqd.sysid.diagnosis.run_files import diagnose
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 from jtqd.sysid.report import page as parts
 from jtqd.sysid.runs.checks import check_runs
@@ -87,7 +87,7 @@ def diagnose_all(numbers: Sequence[int] = JOINTS) -> list[Diagnosed]:
     result = []
     for number in numbers:
         joint = load_joint(shipped(f"kinova_gen3/joint{number}.yaml"))
-        findings = diagnosed([only(run, number) for run in runs], {number: joint})
+        findings = diagnose([only(run, number) for run in runs], {number: joint})
         result.append(Diagnosed(number, joint, findings))
     return result
 

@@ -19,12 +19,14 @@ from jtqd.daemon.logs.read import (
     shadow_errors,
     topics_of,
 )
+from jtqd.daemon.logs.table import Table
 
 __all__ = [
     "LogError",
     "LogFile",
     "Messages",
     "Records",
+    "Table",
     "iter_messages",
     "iter_topics",
     "log_parts",

@@ -387,10 +387,8 @@ def topic_blocks(
 ) -> Iterator[Columns]:
     """Yield all fields of a topic as columns, chunk by chunk: `log_time_ns`, then every field by its path.
 
-    A path is such as `header.stamp.sec`. Arrays and sequences have one column for each element (`data[3]`), blank where a
-    message has fewer; a sequence of more than 256 elements is one column of its values as text.
+    The columns are those of `Table.columns`, blank where a sequence of a message has fewer elements.
     """
-    span = {"start_ns": start_ns, "end_ns": end_ns}
     kinds: dict[str, list[np.dtype[Any]]] = {}
     blocks = 0
     for messages in iter_messages(path, topic, start_ns=start_ns, end_ns=end_ns):
@@ -401,17 +399,13 @@ def topic_blocks(
             kinds.setdefault(name, []).append(values.dtype)
     absent = [np.dtype(float)]
     kind = {name: np.result_type(*each, *absent * (len(each) < blocks)) for name, each in kinds.items()}
-    found = False
     for messages in iter_messages(path, topic, start_ns=start_ns, end_ns=end_ns):
         columns = flat_columns(messages.records)
         for name, each in kind.items():
             if name not in columns:
                 columns[name] = np.full(len(messages.records), "" if each.kind == "O" else np.nan, each)
             columns[name] = columns[name].astype(each, copy=False)
-        found = True
         yield {"log_time_ns": messages.log_times, **{name: columns[name] for name in kind or columns}}
-    if not found:
-        raise LogError(f"{_named(path)}: found no message on {topic}{_when(span)}, expected one at least")
 
 
 # ---- files ----

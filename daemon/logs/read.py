@@ -21,6 +21,7 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from jtqd.daemon.logs.log_file import MESSAGE_HEAD, Batch, LogError, LogFile, pieces
+from jtqd.daemon.logs.table import Table
 from jtqd.daemon.recording.messages import CAN_FRAMES, FRAMES_NAMES
 from jtqd.daemon.recording.run_files import ACTIVE, PART_PATTERN
 from jtqd.estimator.arrays import FloatArray
@@ -42,17 +43,18 @@ Logs = Path | str | Sequence[Path | str]
 """A log, a directory with the parts of one run, or the parts themselves."""
 
 
-def read_topic(path: Logs, topic: str, *, start_ns: int | None = None, end_ns: int | None = None) -> Records:
+def read_topic(path: Logs, topic: str, *, start_ns: int | None = None, end_ns: int | None = None) -> Table:
     """Read all messages of a topic in the order of the files, one field per field of the schema [n].
 
-    Nested messages are nested fields, `header.stamp.sec` is ["header"]["stamp"]["sec"]. See `read_topics`.
+    Nested messages are nested fields, `header.stamp.sec` is ["header"]["stamp"]["sec"]; `Table.columns` and
+    `Table.to_pandas` flatten them. See `read_topics`.
     """
     return read_topics(path, (topic,), start_ns=start_ns, end_ns=end_ns)[topic]
 
 
 def read_topics(
     path: Logs, topics: Sequence[str], *, start_ns: int | None = None, end_ns: int | None = None
-) -> dict[str, Records]:
+) -> dict[str, Table]:
     """Messages of several topics as `read_topic` returns them, in one pass: unpacking the file is what takes the time.
 
     Args:
@@ -65,7 +67,8 @@ def read_topics(
         LogError: no message on a topic in that time, a damaged file, or one whose messages cannot be decoded.
         OSError: a file cannot be read.
     """
-    return {t: m.records for t, m in read_messages(path, topics, start_ns=start_ns, end_ns=end_ns).items()}
+    found = read_messages(path, topics, start_ns=start_ns, end_ns=end_ns)
+    return {topic: messages.records.view(Table) for topic, messages in found.items()}
 
 
 def read_messages(
@@ -76,20 +79,27 @@ def read_messages(
     tables = {topic: _Table(topic) for topic in topics}
     for piece in _pieces(parts, topics, start_ns, end_ns):
         tables[piece.topic].add(piece)
-    span = "" if start_ns is None and end_ns is None else " in that time"
     for topic, table in tables.items():
         if not table.count:
-            there = ", ".join(sorted(topics_of(parts)))
-            raise LogError(f"{parts[0]}: found no message on {topic}{span}, expected one of {there}")
+            raise _no_message(parts, topic, start_ns, end_ns)
     return {topic: table.messages() for topic, table in tables.items()}
+
+
+def _no_message(path: Logs, topic: str, start_ns: int | None, end_ns: int | None) -> LogError:
+    span = "" if start_ns is None and end_ns is None else " in that time"
+    there = ", ".join(sorted(topics_of(path)))
+    return LogError(f"{log_parts(path)[0]}: found no message on {topic}{span}, expected one of {there}")
 
 
 def iter_messages(
     path: Logs, topic: str, *, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[Messages]:
     """Read one topic chunk by chunk, for logs larger than memory. Raises as `read_topics` does."""
+    found = None
     for found in iter_topics(path, (topic,), start_ns=start_ns, end_ns=end_ns):
         yield found[topic]
+    if found is None:
+        raise _no_message(path, topic, start_ns, end_ns)
 
 
 def iter_topics(
@@ -102,7 +112,7 @@ def iter_topics(
 ) -> Iterator[dict[str, Messages]]:
     """Messages of several topics, span by span: a span ends before a chunk with a topic that has `least` messages in it.
 
-    Raises as `read_topics` does.
+    Raises as `read_topics` does, but for a topic without a message, which is in no span.
     """
     tables: dict[str, _Table] = {}
     for piece in _pieces(log_parts(path), topics, start_ns, end_ns):

@@ -1,4 +1,4 @@
-"""Messages of a topic as flat columns."""
+"""Messages of a topic as a table: rows of a structured array, flat columns, a pandas DataFrame."""
 
 from __future__ import annotations
 
@@ -12,6 +12,28 @@ from numpy.typing import NDArray
 Columns = dict[str, NDArray[Any]]
 """Name -> values, all of one length."""
 _LONGEST = 256
+
+
+class Table(np.ndarray[Any, np.dtype[Any]]):
+    """Messages of a topic: a structured array [n], one field per field of the message; one such field is a plain array."""
+
+    def __getitem__(self, key: Any) -> Any:
+        found = super().__getitem__(key)
+        return found.view(np.ndarray) if isinstance(key, str) and found.dtype.names is None else found
+
+    def columns(self) -> Columns:
+        """Return every field as a column [n] by its path, such as `header.stamp.sec`; arrays have one for each element
+        (`data[3]`), sequences of more than 256 one of texts.
+        """
+        return flat_columns(self)
+
+    def to_pandas(self) -> Any:
+        """Return `columns` as a pandas DataFrame. Raises ModuleNotFoundError without pandas, which jtqd does not install."""
+        try:
+            import pandas as pd
+        except ImportError:
+            raise ModuleNotFoundError("to_pandas needs pandas: pip install pandas", name="pandas") from None
+        return pd.DataFrame(self.columns())
 
 
 def flat_columns(records: NDArray[Any]) -> Columns:

@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final
 
 from jtqd import __version__
@@ -27,7 +26,6 @@ from jtqd.estimator.files import write_whole
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.diagnosis.findings import (
-    EVERYTHING,
     NO_GAP,
     SENSOR,
     Cause,
@@ -39,11 +37,10 @@ from jtqd.sysid.diagnosis.findings import (
     to_mapping,
 )
 from jtqd.sysid.diagnosis.limits import PRIORS, RELEVANCE
-from jtqd.sysid.diagnosis.run_files import findings_of, majority
+from jtqd.sysid.diagnosis.run_files import findings_of, usable
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.planner.campaigns import beyond_file, parsed_limits, with_limits
 from jtqd.sysid.planner.plan import Plan
-from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.options import (
@@ -93,7 +90,11 @@ def _main(argv: list[str]) -> int:
             for note in run.notes:
                 print(f"{BY}: {run.name}: {note}", file=sys.stderr)
         limited = {number: with_limits(joint, options.limits) for number, joint in joints.items()}
-        findings = diagnosed(runs, limited, scope, options.relevance, trust)
+        checked = usable(runs, limited, scope)
+        findings = findings_of(runs, limited, checked, scope, options.relevance, trust)
+        for line in (*checked.refused, *checked.notes):
+            if line not in findings.reasons:  # which the summary has
+                print(f"{BY}: {line}", file=sys.stderr)
         findings = replace(
             findings,
             joint_files=joints,
@@ -159,24 +160,6 @@ def _next_experiment(findings: Findings, options: argparse.Namespace) -> dict[st
             notes.append("A towing bench turns freely: travel_rad of --limits is not kept.")
     made["why"] = " ".join([made["why"], *notes])
     return made
-
-
-def diagnosed(
-    runs: Sequence[RunFile],
-    joints: Mapping[int, Joint],
-    scope: Scope = EVERYTHING,
-    relevance: float = RELEVANCE,
-    trust: Mapping[str, float] = MappingProxyType({}),
-) -> Findings:
-    """Check the channels and diagnose what may be used; the findings list what may not. relevance, trust: see `diagnose`."""
-    checked = majority(
-        check_runs([(run.name, run.table) for run in runs], joints, scope.known_references), runs
-    )
-    findings = findings_of(runs, joints, checked, scope, relevance, trust)
-    for line in (*checked.refused, *checked.notes):
-        if line not in findings.reasons:  # which the summary has
-            print(f"{BY}: {line}", file=sys.stderr)
-    return findings
 
 
 def parser() -> argparse.ArgumentParser:

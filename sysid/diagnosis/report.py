@@ -407,6 +407,7 @@ def where(place_: Place) -> str:
 # The page.
 
 TEMPLATE: Final = "report.html.j2"
+_SUMMARY: Final = "summary.html.j2"
 WIDE_IN: Final = 9.2
 _HIGH_IN: Final = 2.6
 """Size of a figure and of a panel [inch]."""
@@ -421,11 +422,8 @@ _TORQUE: Final = {"motor": "motor torque G Kt i", "torsion": "torque by the twis
 def render(findings: Findings) -> str:
     """Return the page. The same findings give the same text. Needs jinja2 and matplotlib (ImportError without them)."""
     content = {
-        "f": findings,
+        **_head(findings, whole=True),
         "made": provenance_text(findings.provenance, most=len(findings.runs) + 8),
-        "badge": BADGES[findings.verdict],
-        "scope": ", ".join(filter(None, (findings.runs_text, joints_text(findings.joints)))),
-        "s": summary(findings),
         "picture": picture(findings),
         "gaps": [(gap, places(gap, most=3)) for gap in findings.gaps],
         "looked_at": [candidate_row(each) for each in findings.candidates],
@@ -441,6 +439,18 @@ def render(findings: Findings) -> str:
         "capital": _capital,
     }
     return page.render("jtqd.sysid.diagnosis", TEMPLATE, content, filters)
+
+
+def summary_html(findings: Findings) -> str:
+    """Return the first part of the page alone: headline, table of entries, lines. Raises ImportError without jinja2."""
+    return page.render("jtqd.sysid.diagnosis", _SUMMARY, _head(findings, whole=False))
+
+
+def _head(findings: Findings, *, whole: bool) -> dict[str, Any]:
+    """Return what the summary shows; whole: the page is around it."""
+    scope = ", ".join(filter(None, (findings.runs_text, joints_text(findings.joints))))
+    badge = BADGES[findings.verdict]
+    return {"f": findings, "badge": badge, "scope": scope, "s": summary(findings), "whole": whole}
 
 
 def candidate_row(each: CandidateEvidence) -> tuple[str, str, str, str]:

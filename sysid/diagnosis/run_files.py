@@ -5,19 +5,82 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
+from jtqd.estimator.command_line import check_installed
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.text import counted
-from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, Scope
+from jtqd.sysid.diagnosis.findings import EVERYTHING, INSUFFICIENT, NO_GAP, Findings, Scope
+from jtqd.sysid.diagnosis.limits import RELEVANCE
 from jtqd.sysid.progress import waiting
-from jtqd.sysid.runs.checks import CheckedRuns, may_leave_out
+from jtqd.sysid.runs.checks import CheckedRuns, check_runs, may_leave_out
 from jtqd.sysid.runs.files import LEFT_OUT
+from jtqd.sysid.runs.options import joint_for_runs
 from jtqd.sysid.runs.run_file import RunFile
 
 _PIECE: Final = re.compile(r" \(\d+ of \d+\)$")
 _FIGURES: Final = re.compile(r"(?<![\w.])[-+]?\d[\d.e+-]*")
+
+JointOrFile = Joint | Path | str
+
+
+class NotebookFindings(Findings):
+    """Findings that a notebook shows as the head of the report: headline, table of entries, lines."""
+
+    def _repr_html_(self) -> str | None:
+        """Return it as HTML; None without jinja2 (extra analysis)."""
+        try:
+            from jtqd.sysid.diagnosis.report import summary_html
+
+            return summary_html(self)
+        except ImportError:
+            return None
+
+
+def diagnose(
+    runs: Sequence[RunFile | tuple[str, RunTable]],
+    joint: JointOrFile | Mapping[int, JointOrFile],
+    scope: Scope = EVERYTHING,
+    *,
+    relevance: float = RELEVANCE,
+    trust: Mapping[str, float] = MappingProxyType({}),
+) -> NotebookFindings:
+    """Return what a joint file's simulation gets wrong in these runs, as `jtq diagnose` does, without a file and a line.
+
+    runs: of `read_runs`, or (name, table); joint: a joint or its file for every joint of the runs, or one for each number;
+    the others: see `diagnose.diagnose`. What may not be used is in `channel_notes`.
+
+    Raises ConfigError for a joint file, for a number without columns, and without scipy (extra analysis).
+    """
+    check_installed("analysis", "scipy")
+    read = [r if isinstance(r, RunFile) else RunFile(r[0], Path(r[0]), "table", "", r[1]) for r in runs]
+    joints = _joints(joint, read)
+    known = scope.known_references.union(*(run.known_loads for run in read))
+    scope = replace(scope, known_references=known)
+    checked = usable(read, joints, scope)
+    findings = findings_of(read, joints, checked, scope, relevance, trust)
+    shown = {"joint_files": joints, "relevance": relevance, "trust": trust}
+    return NotebookFindings(**vars(findings) | shown)
+
+
+def _joints(given: JointOrFile | Mapping[int, JointOrFile], runs: Sequence[RunFile]) -> dict[int, Joint]:
+    there = sorted({number for run in runs for number in run.table.joints})
+    each = given if isinstance(given, Mapping) else dict.fromkeys(there, given)
+    for number in each:
+        if number not in there:
+            have = ", ".join(f"j{n}" for n in there)
+            raise ConfigError(f"joint {number}: found no columns of it in the runs, which have {have}")
+    return {n: j if isinstance(j, Joint) else joint_for_runs(Path(j), runs, n) for n, j in each.items()}
+
+
+def usable(runs: Sequence[RunFile], joints: Mapping[int, Joint], scope: Scope) -> CheckedRuns:
+    """Return what may be used of the runs, and one line for each fault (`majority`)."""
+    checked = check_runs([(run.name, run.table) for run in runs], joints, scope.known_references)
+    return majority(checked, runs)
 
 
 def majority(checked: CheckedRuns, runs: Sequence[RunFile]) -> CheckedRuns:

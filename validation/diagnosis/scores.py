@@ -21,8 +21,8 @@ import yaml
 
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.run import RunTableError
-from jtqd.sysid.diagnosis.command import diagnosed
 from jtqd.sysid.diagnosis.findings import CERTAIN, Cause, Findings, Gap, Place
+from jtqd.sysid.diagnosis.run_files import diagnose
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.options import joints_of
 from jtqd.sysid.runs.run_file import RunError
@@ -66,7 +66,7 @@ def judged(runs: Sequence[Columns], joints: Mapping[int, Joint], recorder: Recor
         paths, files = write(Path(folder), runs, joints, recorder, seed)
         try:
             read = read_runs(paths, segments=True)  # as the command does
-            return diagnosed(read, joints_of(files, read))
+            return diagnose(read, joints_of(files, read))
         except (ConfigError, RunError, RunTableError) as error:
             text = str(error).replace(folder, "")
         except Exception as error:

@@ -511,11 +511,13 @@ def test_every_element_of_a_sequence_is_a_column(tmp_path, name, chunk_size):
         assert main([ending, str(tmp_path / "bag.mcap"), "--topic", "/t", "--out", str(out)]) == 0
     table = parquet.read_table(tmp_path / "t.parquet").to_pydict()
     assert table.pop("log_time_ns") == list(range(len(messages)))
-    whole = {
-        key: [None if isinstance(each, float) and math.isnan(each) else each for each in column]
-        for key, column in table.items()
-    }
-    assert whole == expected
+    flat = {key: column.tolist() for key, column in read_topic(tmp_path / "bag.mcap", "/t").columns().items()}
+    for each in (table, flat):
+        whole = {
+            key: [None if isinstance(one, float) and math.isnan(one) else one for one in column]
+            for key, column in each.items()
+        }
+        assert whole == expected
     rows = list(csv.DictReader((tmp_path / "t.csv").open()))
     assert list(rows[0]) == ["log_time_ns", *table]
     assert {key: [row[key] for row in rows] for key in table} == {

@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 import tracemalloc
+import types
 import zlib
 
 import lz4.frame
@@ -25,6 +26,7 @@ from numpy.lib.recfunctions import repack_fields
 
 from jtqd.daemon.logs import (
     LogError,
+    Table,
     iter_messages,
     iter_topics,
     log_parts,
@@ -656,3 +658,46 @@ def test_a_summary_that_promises_too_few_or_too_many_messages_changes_nothing(
     monkeypatch.setattr(LogFile, "_open", promise)
     assert read_topic(parts, "/joint/1/state").tobytes() == whole.tobytes()
     assert len(whole) == 4200
+
+
+def test_a_topic_is_a_table_of_flat_columns(log):
+    table = read_topic(str(log), JOINT)
+    columns = table.columns()
+    assert list(columns)[:2] == ["header.stamp.sec", "header.stamp.nanosec"]
+    assert all(column.shape == (130,) for column in columns.values())
+    assert columns["header.stamp.nanosec"].tolist() == table["header"]["stamp"]["nanosec"].tolist()
+    assert columns["header.frame_id"][0] == table["header"]["frame_id"][0].decode()
+    frames = read_topic(log, FRAMES)
+    assert frames.columns()["frames.data[3][7]"].tolist() == frames["frames"]["data"][:, 3, 7].tolist()
+    assert len(table[table["cycle"] % 2 == 0].columns()["cycle"]) == 65
+
+
+def test_one_field_of_a_table_is_a_plain_array(log):
+    table = read_topic(log, JOINT)
+    assert type(table["torque_nm"]) is np.ndarray
+    assert type(table["torque_nm"] - table["reference_nm"]) is np.ndarray
+    assert type(table["header"]["stamp"]["sec"]) is np.ndarray
+    assert type(table[3:]) is Table
+
+
+def test_pandas_gets_these_columns_and_is_named_where_it_is_missing(log, monkeypatch):
+    table = read_topic(log, JOINT)
+    monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=dict))
+    assert table.to_pandas().keys() == table.columns().keys()
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install pandas$"):
+        table.to_pandas()
+
+
+def test_pandas_itself_takes_them(log):
+    pandas = pytest.importorskip("pandas")
+    table = read_topic(log, JOINT)
+    frame = table.to_pandas()
+    assert isinstance(frame, pandas.DataFrame)
+    assert frame["torque_nm"].to_numpy().tolist() == table["torque_nm"].tolist()
+
+
+def test_a_topic_that_is_missing_lists_those_that_are_there(log):
+    for read_one in (read_topic, lambda *of: list(iter_messages(*of))):
+        with pytest.raises(LogError, match=r"no message on /nothing, expected one of .*/joint/1/state"):
+            read_one(log, "/nothing")
