@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 PROFILES = ("demo", "rest")  # those of `plant_file`, which would import numpy
 PLANT = "campaign_plant.yaml"
 """The bench that the shipped models were identified on."""
+PRIORITY = 40
+"""Of SCHED_FIFO, where it is granted: the nodes stand for hardware, and come before everything but jtqd's loop (80)."""
 
 EXAMPLES = """examples:
   jtq sim --bus vcan0                              two joints and a sensor on SocketCAN
@@ -151,6 +155,8 @@ def _run(options: argparse.Namespace) -> int:
     from jtqd.sim_can.bench import Bench, run
 
     bench = Bench(sources[0], profile, sources[1:], with_sensor=not options.no_sensor)
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     return run(options.bus, bench, options.bitrate, options.duration)
 
 

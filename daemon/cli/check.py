@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import gc
-import os
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +53,6 @@ exit status: 0 all good, 3 warnings, 1 failures, 2 usage"""
 _CAPACITY = 256
 _QUIET_S = 0.5
 _BENCH_WAIT_S = 60.0
-_BENCH_PRIORITY = 40
 
 
 class CheckError(Exception):
@@ -95,7 +93,7 @@ def main(argv: list[str]) -> int:
             who = f"{config.path}: role {config.role}: another master sends SYNC and boots the nodes"
             raise CheckError(f"{who}: on its bus, without --drive-sync, this check listens")
         before_s, began_s = stolen_s(), time.monotonic()
-        with _bus(arguments.bus, config, daemon) as bus:
+        with _bus(arguments.bus, daemon) as bus:
             results = list(
                 _drive(bus, config, arguments.seconds, daemon)
                 if drives
@@ -212,7 +210,7 @@ def _boot(bus: str, config: Config) -> tuple[CheckResult, dict[str, Any]]:
 
 
 @contextmanager
-def _bus(name: str, config: Config, daemon: Daemon | None) -> Iterator[str]:
+def _bus(name: str, daemon: Daemon | None) -> Iterator[str]:
     """Return the name of the bus; for "sim" start the emulated bench while it is used."""
     if name != "sim":
         yield daemon.about.bus if daemon else name
@@ -226,9 +224,6 @@ def _bus(name: str, config: Config, daemon: Daemon | None) -> Iterator[str]:
                 if not bench.alive() or time.monotonic() > until:
                     raise CheckError("the emulated bench did not open its bus")
                 time.sleep(0.01)
-            if config.realtime.priority > _BENCH_PRIORITY:
-                with suppress(PermissionError):  # the emulated nodes stand for hardware
-                    os.sched_setscheduler(bench.pid, os.SCHED_FIFO, os.sched_param(_BENCH_PRIORITY))
             yield f"unix:{path}"
         finally:
             bench.end()

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import starmap
-from math import isfinite
+from math import inf, isfinite
 from types import TracebackType
 from typing import Any
 
@@ -24,7 +24,7 @@ from jtqd.daemon.shared.counters import Shown, shown_in
 from jtqd.daemon.shared.events import INFO, OperatorLog, Priority
 from jtqd.daemon.shared.reasons import contact_of, contact_text
 from jtqd.daemon.shared.snapshot import JointView, ShadowView, SnapshotReader, View, bus_load
-from jtqd.estimator.status import NAMES, PUBLISHED
+from jtqd.estimator.status import NAMES, PUBLISHED, STALE
 from jtqd.estimator.text import counted, finite, number, percent, printable
 
 COLOURS = {"valid": "green", "degraded": "yellow", "standstill": "cyan", "starting": "blue", "off": "dim"}
@@ -262,13 +262,39 @@ class Summary:
     """Processor time that a hypervisor took."""
     contacts: bool = False
     """They were watched."""
+    deadline_us: float = inf
+    """After SYNC, for inputs."""
+    bench: bool = False
+    """The nodes were those of `--bus sim`."""
 
     @property
     def exit_status(self) -> int:
-        """Return the exit status: 0 done, 1 ended by a failure, 3 done with cycles missing in the log."""
-        if self.error:
+        """Return the exit status: 0 done, 1 ended by a failure or without an estimate, 3 cycles are missing in the log."""
+        if self.error or self.no_estimate:
             return 1
         return 3 if self.recording is not None and self.recording.get("lost", 0) else 0
+
+    @property
+    def no_estimate(self) -> str:
+        """Return what was late in a run that was stale for most of its time and had no estimate; "" for any other."""
+        of_joints, cycles = self.view.status_cycles, self.view.counters["cycles"]
+        stale = sum(each[STALE] for each in of_joints)
+        if 2 * stale <= sum(map(sum, of_joints)) or any(each[s] for each in of_joints for s in PUBLISHED):
+            return ""
+        late, lost = (sum(each[kind] for each in self.inputs.values()) for kind in ("late", "lost"))
+        inputs = f"inputs came later than {self.deadline_us:.0f} us after SYNC {late} times, and {lost} times not at all"
+        if self._missed > _LOST or self.late_us[1] > self.deadline_us:
+            who = f"this machine: {100.0 * self._missed:.0f} % of the slots missed, SYNC {self.late_us[1]:.0f} us late (p99)"
+        else:
+            who = (
+                f"the {'emulated bench (on a busy machine)' if self.bench else 'bus or its nodes'}: {inputs}"
+            )
+        return f"in {cycles} cycles; late was {who}"
+
+    @property
+    def _missed(self) -> float:
+        cycles, missed = self.view.counters["cycles"], self.view.counters["missed"]
+        return missed / max(cycles + missed, 1)
 
     def content(self) -> dict[str, Any]:
         """Return the summary as plain data for JSON."""
@@ -304,6 +330,7 @@ class Summary:
             "not_granted": list(self.refused),
             "inputs": self.inputs,
             "recording": self.recording,
+            "no_estimate": self.no_estimate or None,
             "error": self.error,
         }
 
@@ -316,10 +343,9 @@ class Summary:
             f"cycle work    {quantiles.format(*self.work_us)} (from wake-up to hand-over)",
             f"SYNC lateness {quantiles.format(*self.late_us)}",
         ]
-        if missed > _LOST * (cycles + missed):
+        if self._missed > _LOST:
             why = " (jtqd was not granted all that it asked for)" if self.refused else ""
-            share = 100.0 * missed / (cycles + missed)
-            text = f"not kept: {share:.0f} % of the slots missed{why}; jtq doctor looks at the machine"
+            text = f"not kept: {100.0 * self._missed:.0f} % of the slots missed{why}; jtq doctor looks at the machine"
             lines.append(f"real time     {text}")
         if self.stolen_s > 0.0:
             lines.append(f"processors    {self.stolen_s:.2f} s stolen by the hypervisor")
@@ -370,6 +396,8 @@ class Summary:
             if shown:
                 lines.append(f"  {name:<24} {shown}")
         lines += self._recorded()
+        if self.no_estimate:
+            lines.append(f"no estimate   {self.no_estimate}")
         if self.error:
             lines.append(f"ended by      {self.error}")
         return "\n".join(lines)
@@ -385,6 +413,8 @@ def summary_of(
     began_s: float,
     stolen_s: float,
     contacts: bool = False,
+    deadline_us: float = inf,
+    bench: bool = False,
 ) -> Summary:
     """Return the summary of a run from the snapshot and last answer of its loop; began_s: CLOCK_MONOTONIC."""
     return Summary(
@@ -398,4 +428,6 @@ def summary_of(
         conditions=tuple(each._replace(first_s=max(0.0, each.first_s - began_s)) for each in history),
         stolen_s=stolen_s,
         contacts=contacts,
+        deadline_us=deadline_us,
+        bench=bench,
     )

@@ -56,7 +56,6 @@ _WARM_UP_TIMEOUT_S = 60.0
 """Generous: a controller may load its libraries from a slow card; nothing is published meanwhile."""
 _BOOT_REQUESTS = 100
 """SDO requests of a node's boot, at most; each may take the time that the configuration allows it."""
-_BENCH_PRIORITY = 40
 
 Stopped = Callable[[], bool]
 
@@ -113,7 +112,7 @@ def start_bench(config: Config, bus: str, start_child: StartChild) -> Child:
     return start_child("jtqd.sim_can", arguments, "the emulated bench")
 
 
-def await_bench(config: Config, bus: str, bench: Child) -> None:
+def await_bench(bus: str, bench: Child) -> None:
     """Wait until the emulated bench has opened its bus. Raises SupervisorError."""
     path = Path(bus.removeprefix("unix:"))
     deadline = time.monotonic() + _WARM_UP_TIMEOUT_S
@@ -123,10 +122,6 @@ def await_bench(config: Config, bus: str, bench: Child) -> None:
         if time.monotonic() > deadline:
             raise SupervisorError("the emulated bench did not open its bus")
         time.sleep(0.01)
-    if config.realtime.priority > _BENCH_PRIORITY:
-        # The emulated nodes stand for hardware: they come before everything but the loop.
-        with suppress(PermissionError):
-            os.sched_setscheduler(bench.pid, os.SCHED_FIFO, os.sched_param(_BENCH_PRIORITY))
 
 
 def boot_nodes(config: Config, bus: str, child: Child, stopped: Stopped) -> dict[str, Any] | None:
@@ -311,7 +306,7 @@ class Supervisor:
         loop = self._child("jtqd.daemon.loop.process", [json.dumps(self._loop_request())], "the loop")
         boot = self._child("jtqd.drivers.boot", own_eds(self._config), "the boot")
         if bench is not None:
-            await_bench(self._config, self._bus, bench)
+            await_bench(self._bus, bench)
         socket = self._open_bus() if socket is None else socket
         report = boot_nodes(self._config, self._bus, boot, self._stopped)
         if report is None:
@@ -376,6 +371,8 @@ class Supervisor:
             began_s=began_s,
             stolen_s=stolen,
             contacts=self._config.contact is not None,
+            deadline_us=self._config.input_deadline_ns / 1000,
+            bench=self._emulate,
         )
 
     def _open_bus(self) -> FrameSocket:

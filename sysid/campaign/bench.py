@@ -300,7 +300,6 @@ _END_S: Final = 30.0
 _MARGIN_S: Final = 60.0
 """jtqd ends by itself this long after a run, if the campaign cannot end it."""
 _POLL_S: Final = 0.1
-_BENCH_PRIORITY: Final = 40
 _PR_SET_PDEATHSIG: Final = 1
 _LIBC: Final = ctypes.CDLL(None)
 
@@ -395,8 +394,6 @@ def emulated_bench(
 
     try:
         _wait_for(process, ready, messages, "the emulated bench", ": not ready")
-        with suppress(PermissionError):  # it stands for hardware: before everything but jtqd's loop
-            os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(_BENCH_PRIORITY))
         yield
     finally:
         _end(process)

@@ -18,7 +18,7 @@ from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub
 from jtqd.drivers.sensor import sensor_tpdo1
 from jtqd.sim_can.bench import map_pdos
-from jtqd.sim_can.command import main
+from jtqd.sim_can.command import PRIORITY, main
 
 pytestmark = pytest.mark.native
 
@@ -112,6 +112,19 @@ def test_bench_answers_sdo_and_sync_on_a_unix_bus_and_leaves_in_order(running):
     assert process.wait(5.0) == 0
     assert not os.path.exists(bus.removeprefix("unix:"))
     assert process.stderr.read() == ""
+
+
+def test_the_bench_asks_for_the_priority_of_hardware(running):
+    """Whoever starts it: beside a SCHED_FIFO jtqd on a busy machine it would answer late."""
+    _, process = running
+    granted = os.sched_getscheduler(process.pid), os.sched_getparam(process.pid).sched_priority
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    except PermissionError:
+        assert granted == (os.SCHED_OTHER, 0)
+    else:
+        assert granted == (os.SCHED_FIFO, PRIORITY)
 
 
 def test_second_bench_joins_the_hub_of_another_process(running, tmp_path):

@@ -14,6 +14,7 @@ from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN, SHADOW
 from jtqd.daemon.shared.snapshot import JointView, Snapshot, SnapshotReader
 from jtqd.daemon.supervisor.display import LiveTable, Summary, plain_line, summary_of
+from jtqd.estimator.status import NAMES
 from tests.daemon.snapshots import EstimateWriter
 from tests.daemon.supervisor.watch_views import NAN, view
 
@@ -156,6 +157,43 @@ def test_the_summary_as_json(tmp_path: Path, watched: bool, contacts: int | None
         reader, {}, [], None, history=(), began_s=0.0, stolen_s=0.318, contacts=watched
     ).content()
     assert (found["contacts"], found["stolen_s"]) == (contacts, 0.32)
+
+
+LATE = {"181h": {"late": 900, "lost": 3}, "281h": {"late": 40, "lost": 0}}
+
+
+def of_statuses(**cycles: int) -> tuple[int, ...]:
+    """Cycles of a joint by status."""
+    return tuple(cycles.get(NAMES.get(code, ""), 0) for code in range(16))
+
+
+@pytest.mark.parametrize(
+    ("joints", "counters", "fields", "late"),
+    [
+        (({"stale": 900, "off": 100},) * 2, {}, {"bench": True}, "the emulated bench"),
+        (({"stale": 900, "off": 100},) * 2, {}, {}, "the bus"),
+        (({"stale": 900}, {"stale": 900}), {"missed": 60}, {"bench": True}, "this machine: 6 %"),
+        (({"stale": 900}, {"stale": 900}), {}, {"late_us": (1.0, 900.0, 950.0)}, "this machine: 0 %"),
+        (({"stale": 999, "valid": 1}, {"stale": 1000}), {}, {"bench": True}, ""),
+        (({"stale": 10, "off": 990}, {"off": 1000}), {}, {}, ""),
+        (({"off": 1000}, {"drive_fault": 1000}), {}, {}, ""),
+    ],
+)
+def test_a_run_without_an_estimate_names_what_was_late(
+    joints: tuple[dict[str, int], ...], counters: dict[str, int], fields: dict[str, Any], late: str
+) -> None:
+    counted = {"cycles": 940, **counters}
+    seen = view(940, **counted)._replace(status_cycles=tuple(of_statuses(**each) for each in joints))
+    options: dict[str, Any] = {"work_us": US, "late_us": US, "deadline_us": 850.0, "inputs": LATE} | fields
+    made = Summary(seen, **options)
+    assert made.exit_status == (1 if late else 0)
+    [*lines] = [line for line in made.text().splitlines() if line.startswith("no estimate")]
+    assert len(lines) == bool(late)
+    if late:
+        assert f"late was {late}" in lines[0]
+        assert made.content()["no_estimate"] in lines[0]
+    if "this machine" not in late and late:
+        assert "850 us after SYNC 940 times, and 3 times not at all" in lines[0]
 
 
 # Shadow methods
