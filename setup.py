@@ -18,6 +18,8 @@ SOURCES = Path("src") / "jtqd"
 SHARED = "jtqd._cython"
 """Cython's own code for memory views, once for all modules: alone it is more than the C of most of them."""
 BUILD = os.environ.get("JTQD_BUILD", "release")
+OLDEST = (3, 11)
+"""Python from which on the modules run: they use its limited API, so that one wheel serves all that follow."""
 
 # -ffp-contract=off: no fused multiply-add, so that every machine computes the same bits
 FLAGS = {
@@ -55,6 +57,12 @@ class BuildExtensions(build_ext):
             super().run()
         except (CompileError, LinkError) as error:
             raise SystemExit(_needs(f"a C compiler that works ({error})")) from None
+        if (
+            self.inplace
+        ):  # beside one for this Python alone, which comes first, a module would never be imported
+            for made in (Path(self.get_ext_fullpath(each.name)) for each in self.extensions):
+                for other in {*made.parent.glob(f"{made.name.partition('.')[0]}.*.so")} - {made}:
+                    other.unlink()
 
 
 def _needs(what: str) -> str:
@@ -78,6 +86,8 @@ def extensions() -> list[Extension]:
         Extension(
             ".".join(source.relative_to("src").with_suffix("").parts),
             [str(source)],
+            define_macros=[("Py_LIMITED_API", f"0x{OLDEST[0]:02X}{OLDEST[1]:02X}0000")],
+            py_limited_api=True,
             extra_compile_args=flags,
             extra_link_args=linked,
         )
@@ -102,5 +112,8 @@ if __name__ == "__main__":
             },
         ),
         cmdclass={"build_ext": BuildExtensions},
-        options={"build_ext": {"parallel": os.cpu_count()}},
+        options={
+            "build_ext": {"parallel": os.cpu_count()},
+            "bdist_wheel": {"py_limited_api": f"cp{OLDEST[0]}{OLDEST[1]}"},
+        },
     )

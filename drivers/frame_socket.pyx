@@ -10,8 +10,8 @@ sends, every other member receives; the sender too when it asks for the echo (bi
 of frames. With a wire, frames cross that model first. hub.py has the socket's file, the wire and the command.
 """
 
-from cpython.bytearray cimport PyByteArray_AS_STRING
-from cpython.bytes cimport PyBytes_AS_STRING, PyBytes_FromStringAndSize, PyBytes_GET_SIZE
+from cpython.bytearray cimport PyByteArray_AsString
+from cpython.bytes cimport PyBytes_AsString, PyBytes_FromStringAndSize, PyBytes_Size
 from cpython.exc cimport PyErr_CheckSignals
 from cpython.mem cimport PyMem_Calloc, PyMem_Free
 from libc.errno cimport EAGAIN, ECONNRESET, EINTR, EINVAL, ENOBUFS, ENODEV, ENOMEM, EPIPE, errno
@@ -79,7 +79,7 @@ cdef class FrameReceiver:
         self.capacity = capacity
         self.frames = bytearray(FRAME_SIZE * capacity)
         self.held = memoryview(self.frames)  # as long as it is exported it cannot be resized, and so not be moved
-        self.frames_c = <Frame *>PyByteArray_AS_STRING(self.frames)
+        self.frames_c = <Frame *>PyByteArray_AsString(self.frames)
         self.stamps_c = <int64_t *>PyMem_Calloc(capacity, sizeof(int64_t))
         self.messages = <mmsghdr *>PyMem_Calloc(capacity, sizeof(mmsghdr))
         self.slots = <Slot *>PyMem_Calloc(capacity, sizeof(Slot))
@@ -224,9 +224,9 @@ cdef class FrameSocket:
 
         Raises BusDown or BusGone; BusError for a frame the kernel refuses, and for one that is not 16 bytes.
         """
-        if PyBytes_GET_SIZE(frame16) != sizeof(Frame):
+        if PyBytes_Size(frame16) != sizeof(Frame):
             raise self.failure(EINVAL)
-        return self.put(<const Frame *>PyBytes_AS_STRING(frame16))
+        return self.put(<const Frame *>PyBytes_AsString(frame16))
 
     cdef bint put(self, const Frame *frame) except -1:
         """As `send`."""
@@ -424,7 +424,7 @@ cdef class LocalPort(Member):
         if len(frame16) != sizeof(Frame):
             self.relay.counters.malformed += 1
             return False
-        return self.relay.submit(self, <const Frame *>PyBytes_AS_STRING(frame16), -1)
+        return self.relay.submit(self, <const Frame *>PyBytes_AsString(frame16), -1)
 
     cdef bint take(self, const Frame *frame, int64_t stamp_ns) except -1:
         if self.hears_all or frame.id <= STANDARD_ID and self.hears[frame.id]:
@@ -624,7 +624,7 @@ cdef class Relay:
             try:
                 for sender, frame16, end_ns in ended:
                     self._answering_ns = end_ns
-                    self.deliver(sender, <const Frame *>PyBytes_AS_STRING(frame16), end_ns + to_realtime)
+                    self.deliver(sender, <const Frame *>PyBytes_AsString(frame16), end_ns + to_realtime)
             finally:
                 self._answering_ns = None
         return 0
@@ -640,7 +640,7 @@ cdef class Relay:
             self.deliver_one(sender, frame, stamp_ns)
             while self.queue:
                 sender, waiting, stamp_ns = self.queue.popleft()
-                self.deliver_one(sender, <const Frame *>PyBytes_AS_STRING(waiting), stamp_ns)
+                self.deliver_one(sender, <const Frame *>PyBytes_AsString(waiting), stamp_ns)
         finally:
             self.delivering = False
         return 0

@@ -24,7 +24,8 @@ from tests.paths import ROOT
 from tests.systemd.systemd_wheels import build_wheel, copy_sources, make_wheels
 
 PACKAGES = ("daemon", "drivers", "estimator", "models", "sim_can", "sysid")
-EXT_SUFFIX = sysconfig.get_config_var("EXT_SUFFIX")
+EXT_SUFFIX = ".abi3.so"
+"""Of every Python from 3.11 on."""
 DIST_INFO = f"jtqd-{jtqd.__version__}.dist-info"
 _HOOK = "import sys, setuptools.build_meta as backend; getattr(backend, sys.argv[1])(sys.argv[2])"
 
@@ -73,6 +74,21 @@ def test_every_entry_point_exists() -> None:
     for group, entries in groups.items():
         for name, value in entries.items():
             assert callable(EntryPoint(name, value, group).load()), f"{group}: {name} = {value}"
+
+
+def test_one_wheel_serves_every_python_from_the_oldest_on(wheel: Path) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    oldest = project["requires-python"].removeprefix(">=").replace(".", "")
+    assert wheel.name.split("-")[2:4] == [f"cp{oldest}", "abi3"]
+
+
+def test_a_module_for_one_python_alone_does_not_hide_the_new_one(source: Path) -> None:
+    """One that was compiled in place before stood first in the order of endings."""
+    old = source / "src" / "jtqd" / f"_cython{sysconfig.get_config_var('EXT_SUFFIX')}"
+    old.write_bytes(b"")
+    command = [sys.executable, "setup.py", "-q", "build_ext", "--inplace"]
+    subprocess.run(command, cwd=source, check=True, capture_output=True)
+    assert [path.name for path in old.parent.glob("_cython.*.so")] == [f"_cython{EXT_SUFFIX}"]
 
 
 def test_the_wheel_holds_jtqd_alone_with_all_its_data(wheel: Path) -> None:

