@@ -16,6 +16,7 @@ import struct
 import subprocess
 import sys
 import time
+import urllib.request
 from contextlib import suppress
 from pathlib import Path
 
@@ -271,6 +272,75 @@ def wrong_configuration():
     return {}, {**seen, "reported": line}
 
 
+def guest(root, configuration):
+    """Beside a master of the canopen library that comes later and pauses: neither start nor watchdog waits for its SYNC."""
+    good = CONFIG.read_text()
+    CONFIG.write_text(Path(configuration).read_text().replace(f"{root}/models/", ""))
+    python = ("/opt/jtqd/bin/python", f"{root}/tests/daemon/bus/library_master.py", "socketcan", BUS)
+    master = subprocess.Popen(python, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def order(line):
+        print(line, file=master.stdin, flush=True)
+        assert master.stdout.readline().strip() in ("ready", line.split()[0])
+
+    try:
+        assert master.stdout.readline() == "ready\n"
+        began = time.monotonic()
+        run("systemctl", "start", UNIT)
+        ready = time.monotonic() - began
+        pid = main_pid()
+        watch = Watch()
+        watch.empty()
+        time.sleep(6.0)  # three times WatchdogSec
+        assert watch.next(0.1) is None, "a guest sends neither SYNC nor NMT, and no estimate without SYNC"
+        watch.close()
+        assert (active(), main_pid()) == (True, pid), journal()
+        order(f"period {PERIOD_US * 1e-6}")
+        order("boot")
+        first = estimates(60, GOOD | {3})
+        order("pause 6")
+        again = estimates(60, GOOD | {3})
+        assert (active(), main_pid()) == (True, pid), journal()
+        run("systemctl", "stop", UNIT)
+        assert show("Result") == "success", show("Result")
+    finally:
+        master.kill()
+        CONFIG.write_text(good)
+    return {"to READY=1 without a master": ready, "from boot": first, "after a pause": again}, {}
+
+
+def page(root):
+    """The page of a service: with the shipped unit's sandbox one line and no page, with the drop-in of the docs a page."""
+    text = Path(f"{root}/docs/deployment.md").read_text()
+    [dropped] = re.findall(r"^    (\[Service\]\n(?:    .*\n)+)", text, re.MULTILINE)
+    lines = [line.strip() for line in dropped.splitlines()]
+    folder = Path("/run/systemd/system/jtqd@.service.d")
+    folder.mkdir()
+    only = [line for line in lines if not line.startswith(("Restrict", "IPAddress", "SocketBind"))]
+    seen = {}
+    for name, content in (("sandbox of the unit", only), ("drop-in", lines)):
+        (folder / "live.conf").write_text("\n".join(content) + "\n")
+        run("systemctl", "daemon-reload")
+        run("systemctl", "restart", UNIT)
+        estimates(30)
+        if name == "drop-in":
+            until(lambda: "http" in journal(40), 20, "a line about the page")
+        else:
+            until(lambda: "live view" in journal(60), 20, "a line about what is forbidden")
+            seen[name] = re.findall(r"jtqd.*: (.*live view.*)", journal(60))[-1]
+            assert "Traceback" not in journal(60)
+    with urllib.request.urlopen("http://127.0.0.1:8765/", timeout=20) as answer:
+        assert b"uPlot" in answer.read()
+    score = run("systemd-analyze", "security", UNIT, "--no-pager").stdout.splitlines()[-1]
+    seen["exposure"] = float(re.search(r"([0-9.]+) [A-Z]+", score).group(1))
+    assert seen["exposure"] <= 2.0, score
+    (folder / "live.conf").unlink()
+    folder.rmdir()
+    run("systemctl", "daemon-reload")
+    run("systemctl", "stop", UNIT)
+    return {}, seen
+
+
 def killed(which):
     before = restarts()
     pids = loops()
@@ -425,7 +495,11 @@ STEPS = {
 
 
 def main(root, wheel, wheels, *steps):
-    known = STEPS | {"uninstall": lambda: uninstall(root)}
+    known = STEPS | {
+        "uninstall": lambda: uninstall(root),
+        "guest": lambda: guest(root, Path(wheels).parent / "guest.yaml"),
+        "page": lambda: page(root),
+    }
     chosen = {"install": lambda: install(root, wheel, wheels)} | {name: known[name] for name in steps}
     if "full disk" in steps:
         # Small, so that it fills quickly.

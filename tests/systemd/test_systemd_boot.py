@@ -13,12 +13,13 @@ from typing import Any
 import pytest
 
 from jtqd.sim_can.bench_kernel import build, guest
+from tests.daemon.bus.test_guest_on_vcan import configuration
 from tests.systemd.systemd_wheels import ROOT, make_environment, make_wheels
 
 DRIVER = Path(__file__).with_name("systemd_driver.py")
 PYTHON = Path("/usr/bin/python3")
 pytestmark = pytest.mark.boots
-SHORT = ("start", "changed file", "stopped loop", "stop", "wrong configuration")
+SHORT = ("start", "changed file", "stopped loop", "stop", "wrong configuration", "page", "guest")
 LONG = (
     *("start", "changed file", "stopped loop", "stopped supervisor"),
     *("killed supervisor", "killed loop"),
@@ -28,6 +29,8 @@ LONG = (
         "full disk",
         "stop",
         "wrong configuration",
+        "page",
+        "guest",
         "uninstall",
     ),
 )
@@ -51,6 +54,8 @@ def booted(directory: Path, steps: tuple[str, ...], *, whole: bool) -> dict[str,
         pytest.skip(f"systemd not tested: {reason}")
     wheels = directory / "wheels"
     own = make_wheels(wheels)
+    inputs, sync = {"wait_us": 2000, "deadline_us": 4250}, {"period_us": 5000, "counter_overflow": 0}
+    configuration(directory, dcf=False, sync=sync, inputs=inputs, recording={"reserve_mb": 1})
     prepared = () if whole else ("prepared", str(make_environment(own, directory / "opt")))
     arguments = prepared or (str(own), str(wheels))
     command = [str(PYTHON), str(DRIVER), str(ROOT), *arguments, *steps]

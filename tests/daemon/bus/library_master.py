@@ -80,6 +80,7 @@ class Master:
                 time.sleep(value)
                 self.network.sync.start(self.period_s)
             case "period":
+                self.period_s = value
                 self.network.sync.stop()
                 self.network.sync.start(value)
             case "start" | "stop":
