@@ -88,7 +88,7 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
         if hook in hooks:
             value = sign * getattr(effect, hook)(p, state, own, x) * np.ones(len(s.time_s))
             if s.torsion_nm is not None:  # the spring twists by it, too, and the link lags by that
-                twist = s.as_torque_is_known(value / joint.stiffness_nm_per_rad)
+                twist = s.followed(value / joint.stiffness_nm_per_rad)
                 value -= joint.link_inertia_kgm2 * second_difference(twist, s.time_s)
             add(MOTOR, s.per_torque * value)
             add(TORSION, value)
@@ -110,7 +110,7 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
                 # the link's acceleration is that of the motor less tau/K (`signals`), so a twist beyond it adds its own, as
                 # far as that of the torque is known: what is quicker turns the spring and not the link. Where it slips with
                 # the encoders' difference, a second difference would be that of their noise
-                bent = joint.link_inertia_kgm2 * second_difference(s.as_torque_is_known(angle), s.time_s)
+                bent = joint.link_inertia_kgm2 * second_difference(s.followed(angle), s.time_s)
                 add(MOTOR, s.per_torque * bent)
                 add(TORSION, bent)
     if s.torsion_nm is None:

@@ -248,9 +248,9 @@ class JointSignals:
         """What the sensor reads [n], as far as a torque is known."""
         return below(self.sensor_nm, self.step_s, self.torque_hz)
 
-    def as_torque_is_known(self, angle: FloatArray) -> FloatArray:
-        """Return what of a twist [n] is as slow as a torque is known."""
-        return angle if self.torsion_nm is None else below(angle, self.step_s, self.torque_hz)
+    def followed(self, angle: FloatArray) -> FloatArray:
+        """Return what of a twist [n] the link's acceleration has less than the motor's."""
+        return angle if self.torsion_nm is None else below(angle, self.step_s, _followed_hz(self.joint, self.torque_hz))
 
     def highest_order(self) -> FloatArray:
         """Return the order of the motor whose wave is as quick as what these balances hold, at each sample [n]."""
@@ -433,8 +433,11 @@ def joint_signals(  # noqa: PLR0917
     both = raw.two_encoders(joint.gear_ratio)
     shown = known_below_hz(sensor, step)
     known, known_motion = like.torque_hz if like else max(COMPUTED_HZ, shown), motion.visible
-    if like is None and both and (static := max(COMPUTED_HZ, _STATIC * _swings_hz(joint))) < shown:
-        motion = motion.below(static, step, "quicker than the spring follows")
+    if like is None and both:
+        static, held = _static_hz(joint), motion.visible(motion.whole)
+        quick = joint.link_inertia_kgm2 / joint.gear_ratio * (held - below(held, step, static))
+        if static < shown or float(np.std(quick)) > _VISIBLE * joint.rated_torque_nm:
+            motion = motion.below(static, step, "quicker than the spring follows")
     velocity = motion.visible(motion.speed) / joint.gear_ratio
     link = columns.link_position_rad
     if link is None:
@@ -444,7 +447,8 @@ def joint_signals(  # noqa: PLR0917
     slow_sensor = below(sensor, step, known)
     if both:
         # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
-        torsion_acceleration = second_difference(slow_sensor, time) / joint.stiffness_nm_per_rad
+        followed = below(sensor, step, _followed_hz(joint, known))
+        torsion_acceleration = second_difference(followed, time) / joint.stiffness_nm_per_rad
         link_acceleration = link_acceleration - torsion_acceleration
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
     slow_torque = below(gear_torque, step, known)
@@ -512,10 +516,21 @@ def joint_signals(  # noqa: PLR0917
     )
 
 
-def _swings_hz(joint: Joint) -> float:
-    """Return the frequency at which the link swings on its spring while the motor stands, inf without a link."""
+def _static_hz(joint: Joint) -> float:
+    """Return the frequency below which the spring follows the torque: a part of that at which the link swings on it while the
+    motor stands; inf without a link.
+    """
     inertia = joint.link_inertia_kgm2
-    return math.sqrt(joint.stiffness_nm_per_rad / inertia) / math.tau if inertia > 0.0 else math.inf
+    swings = math.sqrt(joint.stiffness_nm_per_rad / inertia) / math.tau if inertia > 0.0 else math.inf
+    return max(COMPUTED_HZ, _STATIC * swings)
+
+
+def _followed_hz(joint: Joint, torque_hz: float) -> float:
+    """Return up to which frequency the spring's twist is taken off the motor's acceleration to have the link's: there the
+    torque's noise is worth a tenth of itself at most.
+    """
+    static = _static_hz(joint)
+    return max(torque_hz, static) if math.isfinite(static) else torque_hz
 
 
 def _cost(
