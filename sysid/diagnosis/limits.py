@@ -119,7 +119,7 @@ FEATURES: Final = 12
 LENGTH: Final = 1.0
 """Its length scale, in standard deviations of the operating conditions."""
 FLOOR: Final = 1e-3
-"""Prior size of the discrepancy, part of the rated torque, worth FLOOR_COUNT features; no balance is known better."""
+"""What the equations are exact to, part of the rated torque; prior size of the discrepancy, worth FLOOR_COUNT features."""
 FLOOR_COUNT: Final = 2.0
 RUNS_COUNT: Final = 4.0
 """Runs that the prior of a run-to-run variation is worth."""

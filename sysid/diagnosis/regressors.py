@@ -472,18 +472,27 @@ class Noise(NamedTuple):
 
 
 def noise_of_channels(
-    residuals: Mapping[Channel, Sequence[FloatArray]], step_s: float, least_nm: float = 0.0
+    residuals: Mapping[Channel, Sequence[FloatArray]],
+    step_s: float,
+    exact_nm: float = 0.0,
+    directions: int = 1,
 ) -> Noise:
-    """Return the noise of all channels from what is left of them [run][n], NaN where not valid, at least least_nm: what the
-    equations are exact to. With an inflation of its own a channel that is fitted badly would weigh little, and stay so.
+    """Return the noise of all channels from what is left of them [run][n], NaN where not valid. With an inflation of its own
+    a channel that is fitted badly would weigh little, and stay so.
+
+    exact_nm: what the equations are exact to, rms. It is no noise: it repeats, so bins do not average it. Spread over the
+    directions that columns span, it is in each of them exact_nm^2 / directions, however many bins there are.
     """
     block = max(1, round(_BLOCK_S / step_s))
-    sigma = {
-        channel: max(float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2))), least_nm, 1e-12)
-        for channel, parts in residuals.items()
-    }
-    slow = [_slowness(parts, sigma[channel], block) for channel, parts in residuals.items()]
-    return Noise(sigma, max(1.0, float(np.mean(slow))))
+    square, bins = {}, {}
+    for channel, parts in residuals.items():
+        every = np.concatenate(parts)
+        square[channel] = max(float(np.nanmean(every**2)), 1e-24)
+        bins[channel] = int(np.isfinite(every).sum())
+    slow = [_slowness(parts, math.sqrt(square[channel]), block) for channel, parts in residuals.items()]
+    inflation = max(1.0, float(np.mean(slow)))
+    repeats = exact_nm**2 / (directions * inflation)
+    return Noise({c: math.sqrt(x + bins[c] * repeats) for c, x in square.items()}, inflation)
 
 
 def _slowness(series: Sequence[FloatArray], sigma: float, block: int) -> float:

@@ -101,6 +101,15 @@ def test_what_wanders_over_seconds_widens_everything() -> None:
     assert noise_of_channels({MOTOR1: [rng.normal(size=12000) + level]}, 0.005).inflation > 10.0
 
 
+def test_what_the_equations_are_exact_to_repeats_in_every_bin() -> None:
+    """A mean over many bins is no more certain than this, spread over so many directions."""
+    for bins in (10_000, 1_000_000):
+        noise = noise_of_channels({MOTOR1: [np.tile([1e-3, -1e-3], bins // 2)]}, 0.005, 0.2, 16)
+        variance = noise.sigma[MOTOR1] ** 2 * noise.inflation / bins
+        assert variance == pytest.approx(0.05**2, rel=1e-3)
+    assert noise_of_channels({MOTOR1: [np.full(9, 0.5)]}, 0.005).sigma[MOTOR1] == pytest.approx(0.5)
+
+
 def test_what_nothing_explains_is_the_residual_of_least_squares() -> None:
     rng = np.random.default_rng(9)
     runs = []

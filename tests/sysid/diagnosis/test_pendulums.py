@@ -456,15 +456,15 @@ def test_a_delay_within_a_step_predicts_and_is_no_certain_cause() -> None:
     """A recorder reads its channels at moments within a step: such a delay is there, and may be the recorder's."""
     runs = []
     for name, table in runs_of(ARM, 25, 6, Rig(rate_hz=100.0, sensor_noise_nm=0.02, counts=2.0**22)):
-        torque = np.interp(table.time_s - 0.004, table.time_s, table.joints[1].torque_nm)
+        torque = np.interp(table.time_s - 0.008, table.time_s, table.joints[1].torque_nm)
         runs.append((name, replace(table, joints={1: replace(table.joints[1], torque_nm=torque)})))
     found = diagnose(runs, {1: ARM})
     [delay] = [c for c in (*found.causes, *found.too_small) if c.name == "channel_delay"]
     assert delay.grade == EFFECTIVE
     low, high = delay.parameters["delay_s"].ci95
-    assert low < 0.004 < high, "a part of it may be a discrepancy in the load's rate"
+    assert low < 0.008 < high, "a part of it may be a discrepancy in the load's rate"
     [predicting] = [p for p in found.predicts if p.name == "channel_delay"]
-    assert predicting.values["delay_s"] == pytest.approx(0.004, abs=4e-4)
+    assert predicting.values["delay_s"] == pytest.approx(0.008, rel=0.2), "drawn to its prior, 3 ms"
 
 
 def test_outliers_are_looked_for_as_recorded_and_balances_judged_where_the_torque_is_known(
