@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,22 +27,22 @@ VISCOUS_PER_K = 0.015
 COULOMB_PER_K = 0.003
 
 _FLAT = 1e-9
+_NO_RATE = {"viscous_per_k": 0.0, "coulomb_per_k": 0.0}
 
 
 @dataclass(frozen=True, slots=True)
 class _Exponential:
-    """c1 (E - 1) + c2 (r E - 1) with E = exp(-k (T - Tp)), r = exp(k SPAN_K), as exp(-b (T - T0)) - 1.
+    """Rates of `names`: c1 (E - 1) + c2 (r E - 1) with E = exp(-k (T - Tp)), r = exp(k SPAN_K), as exp(-b (T - T0)) - 1.
 
     Value and slope are those at the reference Tp, so that it is exact where a single exponential is meant.
     """
 
-    name: str
+    names: tuple[str, ...]
     rate: float
     reference_c: float
-    other: Mapping[str, float]
 
     def __call__(self, c: Sequence[float]) -> dict[str, float]:
-        """Return rate and reference; the file's reference where there is no slope."""
+        """Return the rates and the reference; the file's reference where there is no slope."""
         steep = float(c[0]) + float(c[1]) * math.exp(self.rate * SPAN_K)
         value = 1.0 + steep - (float(c[0]) + float(c[1]))
         rate, reference = 0.0, self.reference_c
@@ -52,15 +52,14 @@ class _Exponential:
                 reference += math.log(value) / rate
         elif steep:
             rate = math.copysign(math.inf, steep)  # friction that would feed energy in: out of any range
-        return {self.name: rate, "reference_c": reference} | dict(self.other)
+        return self._values(rate, reference)
+
+    def _values(self, rate: float, reference_c: float) -> dict[str, float]:
+        return _NO_RATE | dict.fromkeys(self.names, rate) | {"reference_c": reference_c}
 
     def term(self) -> Term:
         """Return the term: columns at the reference and SPAN_K above."""
-        basis = tuple(
-            {self.name: self.rate, "reference_c": self.reference_c + span} | dict(self.other)
-            for span in (0.0, SPAN_K)
-        )
-        return Term(basis, self)
+        return Term(tuple(self._values(self.rate, self.reference_c + span) for span in (0.0, SPAN_K)), self)
 
 
 class TemperatureDependentFriction(Effect):
@@ -92,12 +91,12 @@ class TemperatureDependentFriction(Effect):
         return loss
 
     def terms(self, joint: Joint) -> Terms:
-        """Return two columns (slope over temperature, constant) of viscous and of Coulomb friction."""
+        """Return two columns (slope over temperature, constant) of viscous friction, of Coulomb friction, and of both, which
+        one grease makes fall alike.
+        """
+        there = {"viscous_per_k": joint.friction.viscous_nms_per_rad, "coulomb_per_k": joint.friction.coulomb_nm}
+        rates = {"viscous_per_k": VISCOUS_PER_K, "coulomb_per_k": COULOMB_PER_K}
+        names = tuple(name for name, size in there.items() if size)
+        kinds = [(name,) for name in names] + ([names] if len(names) > 1 else [])
         reference = reference_of(joint.provenance)
-        viscous, coulomb = "viscous_per_k", "coulomb_per_k"
-        terms: list[Term] = []
-        if joint.friction.viscous_nms_per_rad:
-            terms.append(_Exponential(viscous, VISCOUS_PER_K, reference, {coulomb: 0.0}).term())
-        if joint.friction.coulomb_nm:
-            terms.append(_Exponential(coulomb, COULOMB_PER_K, reference, {viscous: 0.0}).term())
-        return tuple(terms)
+        return tuple(_Exponential(kind, rates[kind[0]], reference).term() for kind in kinds)

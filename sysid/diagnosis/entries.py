@@ -191,10 +191,13 @@ def entry_of(
 
 
 def _sizes(c: EffectCandidate) -> int:
-    """Return how many of the parameters that a term changes are sizes, and no phase or reference."""
+    """Return how many of the parameters that a term changes are sizes, and no phase or reference; those that are always alike
+    are one.
+    """
     sizes = {q.name for q in c.effect.parameters if q.neutral is not None and not q.fixed}
     each = [c.term.combine(one) for one in np.eye(c.size).tolist()]
-    return len(sizes & {n for values in each for n, v in values.items() if v != c.nothing[n]})
+    changed = sizes & {n for values in each for n, v in values.items() if v != c.nothing[n]}
+    return len({tuple(values[n] for values in each) for n in changed})
 
 
 def lead_of(c: EffectCandidate) -> str:

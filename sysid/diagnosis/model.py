@@ -460,7 +460,7 @@ class _Work:
             combine = replace(combine, step=(size,))
             e = replace(e, weights=e.weights * step / size)
         elif hasattr(combine, "rate"):  # an exponential, straight at the present rate
-            rate = float(np.clip(abs(values[combine.name]), *_RATES_PER_K))
+            rate = float(np.clip(abs(values[combine.names[0]]), *_RATES_PER_K))
             e = replace(e, weights=e.weights * combine.rate / rate)
             combine = replace(combine, rate=rate)
         else:

@@ -702,3 +702,28 @@ def test_no_noise_and_no_rate_makes_a_wrong_entry_certain(two_encoders: bool, wr
             if not low <= values.get(c.name, math.inf) <= high:
                 off.append(f"{k}: {c.name}")
     assert len({text.split(":")[0] for text in off}) <= 1, off
+
+
+def test_a_grease_that_thins_is_one_rate_of_viscous_and_coulomb_friction() -> None:
+    runs = []
+    for k, (name, table) in enumerate(runs_of(ARM, 31, 5)):
+        columns, ratio = table.joints[1], ARM.gear_ratio
+        warmer = 4.0 * k - 8.0 + 0.4 * table.time_s
+        assert columns.motor_position_rad is not None
+        assert columns.current_a is not None
+        v = np.gradient(signal.savgol_filter(columns.motor_position_rad, 25, 3), table.time_s) / ratio
+        less = friction_of(ARM)(v, v, v) * (np.exp(-0.02 * warmer) - 1.0)
+        current = columns.current_a + less / (ratio * KT)
+        runs.append(
+            (
+                name,
+                replace(
+                    table, joints={1: replace(columns, current_a=current, temperature_c=25.0 + warmer)}
+                ),
+            )
+        )
+    found = diagnose(runs, {1: ARM})
+    assert [c.name for c in found.causes] == ["temperature_dependent_friction"]
+    [cause] = found.causes
+    for name in ("viscous_per_k", "coulomb_per_k"):
+        assert cause.parameters[name].value == pytest.approx(0.02, rel=0.1), name
