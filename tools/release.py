@@ -62,7 +62,8 @@ def build(folder: Path) -> list[Path]:
         sys.executable, "-m", "auditwheel", "repair", "--wheel-dir", folder, built
     )  # its tag: the oldest C library
     built.unlink()
-    wheel = Path(shutil.move(*folder.glob("*.whl"), made))
+    (repaired,) = folder.glob("*.whl")
+    wheel = Path(shutil.move(repaired, made))
     run("tar", "-xf", sdist, "-C", folder)
     same = ("--sort=name", f"--mtime=@{commit_time()}", "--owner=0", "--group=0", "--numeric-owner")
     run("tar", *same, "-I", "gzip -n", "-cf", sdist, "-C", folder, sdist.name.removesuffix(".tar.gz"))

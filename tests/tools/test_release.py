@@ -105,7 +105,9 @@ def test_two_directories_give_the_same_bytes(tmp_path: Path) -> None:
 
     text = one[f"jtqd-{jtqd.__version__}.cdx.json"].decode()
     check = "import sys; from cyclonedx.schema import SchemaVersion as V; from cyclonedx.validation.json import *; "
-    check += "error = JsonStrictValidator(V.V1_6).validate_str(sys.stdin.read()); sys.exit(error and str(error))"
+    check += (
+        "error = JsonStrictValidator(V.V1_6).validate_str(sys.stdin.read()); sys.exit(error and str(error))"
+    )
     python = tmp_path / "one/build/release/bin/python"
     done = subprocess.run([python, "-c", check], input=text, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
