@@ -22,12 +22,9 @@ from jtqd.estimator.effects.effect import (
     reference_of,
 )
 
-VISCOUS_PER_K = 0.015
+_START = {"viscous_per_k": 0.015, "coulomb_per_k": 0.003}
 """Where a search begins: how curved the fall over temperature is."""
-COULOMB_PER_K = 0.003
-
 _FLAT = 1e-9
-_NO_RATE = {"viscous_per_k": 0.0, "coulomb_per_k": 0.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +52,7 @@ class _Exponential:
         return self._values(rate, reference)
 
     def _values(self, rate: float, reference_c: float) -> dict[str, float]:
-        return _NO_RATE | dict.fromkeys(self.names, rate) | {"reference_c": reference_c}
+        return dict.fromkeys(_START, 0.0) | dict.fromkeys(self.names, rate) | {"reference_c": reference_c}
 
     def term(self) -> Term:
         """Return the term: columns at the reference and SPAN_K above."""
@@ -94,9 +91,9 @@ class TemperatureDependentFriction(Effect):
         """Return two columns (slope over temperature, constant) of viscous friction, of Coulomb friction, and of both, which
         one grease makes fall alike.
         """
-        there = {"viscous_per_k": joint.friction.viscous_nms_per_rad, "coulomb_per_k": joint.friction.coulomb_nm}
-        rates = {"viscous_per_k": VISCOUS_PER_K, "coulomb_per_k": COULOMB_PER_K}
-        names = tuple(name for name, size in there.items() if size)
+        own = joint.friction
+        there = (own.viscous_nms_per_rad, own.coulomb_nm)
+        names = tuple(name for name, size in zip(_START, there, strict=True) if size)
         kinds = [(name,) for name in names] + ([names] if len(names) > 1 else [])
         reference = reference_of(joint.provenance)
-        return tuple(_Exponential(kind, rates[kind[0]], reference).term() for kind in kinds)
+        return tuple(_Exponential(kind, _START[kind[0]], reference).term() for kind in kinds)

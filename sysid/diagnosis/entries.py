@@ -191,9 +191,7 @@ def entry_of(
 
 
 def _sizes(c: EffectCandidate) -> int:
-    """Return how many of the parameters that a term changes are sizes, and no phase or reference; those that are always alike
-    are one.
-    """
+    """Return how many of the parameters that a term changes are sizes, no phase or reference; always alike they are one."""
     sizes = {q.name for q in c.effect.parameters if q.neutral is not None and not q.fixed}
     each = [c.term.combine(one) for one in np.eye(c.size).tolist()]
     changed = sizes & {n for values in each for n, v in values.items() if v != c.nothing[n]}

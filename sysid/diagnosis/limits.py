@@ -129,8 +129,6 @@ RIVAL: Final = 6.0
 """Twice the log evidence within which another set is a rival."""
 SURE: Final = 3.0
 """Standard deviations by which a certain entry differs from none."""
-CONFLICT: Final = 3
-"""Entries SURE prior deviations from the file that are at odds with the priors (Evans, Moshonov 2006, Bayesian Anal. 1)."""
 AGREE: Final = 0.06
 """Standard error of the mean size of a certain entry over the runs, part of it; runs are what is independent."""
 SEEN: Final = 0.05

@@ -208,14 +208,10 @@ def solve(dataset: Dataset) -> Solution:
     work = _Work(dataset)
     residuals = work.first_residuals()
     start = work.file_values()
+    exact = limits.FLOOR * dataset.rated_torque_nm, sum(e.size for e in work.entries)
     for turn in range(_TURNS):
         if turn + 1 < _TURNS:  # the last one compares what the one before has moved, on the same noise
-            noise = noise_of_channels(
-                residuals,
-                dataset.step_s,
-                limits.FLOOR * dataset.rated_torque_nm,
-                sum(e.size for e in work.entries),
-            )
+            noise = noise_of_channels(residuals, dataset.step_s, *exact)
         equations = work.equations(noise)
         search = _Search(equations)
         starts = [start, *([frozenset[int]()] if turn < _FROM_NOTHING else [])]

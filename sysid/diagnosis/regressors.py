@@ -484,14 +484,12 @@ def noise_of_channels(
     directions that columns span, it is in each of them exact_nm^2 / directions, however many bins there are.
     """
     block = max(1, round(_BLOCK_S / step_s))
-    square, bins = {}, {}
-    for channel, parts in residuals.items():
-        every = np.concatenate(parts)
-        square[channel] = max(float(np.nanmean(every**2)), 1e-24)
-        bins[channel] = int(np.isfinite(every).sum())
-    slow = [_slowness(parts, math.sqrt(square[channel]), block) for channel, parts in residuals.items()]
+    every = {c: np.concatenate(parts) for c, parts in residuals.items()}
+    square = {c: max(float(np.nanmean(x**2)), 1e-24) for c, x in every.items()}
+    slow = [_slowness(parts, math.sqrt(square[c]), block) for c, parts in residuals.items()]
     inflation = max(1.0, float(np.mean(slow)))
     repeats = exact_nm**2 / (directions * inflation)
+    bins = {c: int(np.isfinite(x).sum()) for c, x in every.items()}
     return Noise({c: math.sqrt(x + bins[c] * repeats) for c, x in square.items()}, inflation)
 
 

@@ -250,7 +250,11 @@ class JointSignals:
 
     def followed(self, angle: FloatArray) -> FloatArray:
         """Return what of a twist [n] the link's acceleration has less than the motor's."""
-        return angle if self.torsion_nm is None else below(angle, self.step_s, _followed_hz(self.joint, self.torque_hz))
+        return (
+            angle
+            if self.torsion_nm is None
+            else below(angle, self.step_s, _followed_hz(self.joint, self.torque_hz))
+        )
 
     def highest_order(self) -> FloatArray:
         """Return the order of the motor whose wave is as quick as what these balances hold, at each sample [n]."""
@@ -447,9 +451,8 @@ def joint_signals(  # noqa: PLR0917
     slow_sensor = below(sensor, step, known)
     if both:
         # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
-        followed = below(sensor, step, _followed_hz(joint, known))
-        torsion_acceleration = second_difference(followed, time) / joint.stiffness_nm_per_rad
-        link_acceleration = link_acceleration - torsion_acceleration
+        twist = below(sensor, step, _followed_hz(joint, known)) / joint.stiffness_nm_per_rad
+        link_acceleration = link_acceleration - second_difference(twist, time)
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
     slow_torque = below(gear_torque, step, known)
     loss = base.loss(gear_torque, velocity)
@@ -517,20 +520,15 @@ def joint_signals(  # noqa: PLR0917
 
 
 def _static_hz(joint: Joint) -> float:
-    """Return the frequency below which the spring follows the torque: a part of that at which the link swings on it while the
-    motor stands; inf without a link.
-    """
+    """Return below which frequency the spring follows the torque: part of that at which the link swings, inf without one."""
     inertia = joint.link_inertia_kgm2
     swings = math.sqrt(joint.stiffness_nm_per_rad / inertia) / math.tau if inertia > 0.0 else math.inf
     return max(COMPUTED_HZ, _STATIC * swings)
 
 
 def _followed_hz(joint: Joint, torque_hz: float) -> float:
-    """Return up to which frequency the spring's twist is taken off the motor's acceleration to have the link's: there the
-    torque's noise is worth a tenth of itself at most.
-    """
-    static = _static_hz(joint)
-    return max(torque_hz, static) if math.isfinite(static) else torque_hz
+    """Return up to which frequency the torque's twist is taken off: its noise is then worth a tenth of itself at most."""
+    return max(torque_hz, _static_hz(joint)) if joint.link_inertia_kgm2 else torque_hz
 
 
 def _cost(

@@ -255,8 +255,8 @@ class Judged:
     """Entries that are one effect, in the set: their places, rms per channel [Nm], twice the log evidence that the best set
     without them lacks, and that the set without them lacks where a discrepancy may imitate them, that best set's entries
     instead, least deviations of the coefficients [z] from none, in the set and its rivals; how much their size differs from
-    run to run, and the standard error of its mean over runs, parts of it; whether it is held at a bound; prior deviations
-    that it is from the file; the values that rivals give them.
+    run to run, and the standard error of its mean over runs, parts of it; whether it is held at a bound; the values that
+    rivals give them.
     """
 
     members: tuple[int, ...]
@@ -269,7 +269,6 @@ class Judged:
     differs: float
     error: float
     held: bool
-    far: float
     elsewhere: tuple[Values, ...] = ()
 
 
@@ -323,7 +322,6 @@ def judged(solution: Solution) -> list[Judged]:
                 math.sqrt(max(min(z2), 0.0)),
                 *sizes.over_runs(at),
                 bool(np.any((size <= plain.low[own]) | (size >= plain.high[own]))),
-                float(np.linalg.norm(size)),
                 tuple(p.values for p in present[1:]),
             )
         )
@@ -355,9 +353,9 @@ def _rms(solution: Solution, present: Present) -> dict[Channel, float]:
     }
 
 
-def grade_of(j: Judged, *, hidden: bool, conflict: bool = False) -> tuple[str, tuple[str, ...]]:
+def grade_of(j: Judged, *, hidden: bool) -> tuple[str, tuple[str, ...]]:
     """Return the grade of an effect, and why it is not certain; see the module. hidden: what remains in its balance is
-    larger than itself; conflict: its set is at odds with the priors.
+    larger than itself.
     """
     size = f"its size differs by {100.0 * j.differs:.0f} % from run to run"
     doubts = {
@@ -367,7 +365,6 @@ def grade_of(j: Judged, *, hidden: bool, conflict: bool = False) -> tuple[str, t
         size if math.isfinite(j.differs) else "one run has no other to agree with": j.error >= limits.AGREE,
         "it is held at the end of its range": j.held,
         "more than it remains in its balance": hidden,
-        f"{limits.CONFLICT} entries are {limits.SURE:g} prior deviations off: a law may be missing": conflict,
     }
     found = tuple(text for text, holds in doubts.items() if holds)
     return (ONE_OF if j.delta <= limits.RIVAL and j.rivals else EFFECTIVE if found else CERTAIN), found
@@ -387,10 +384,8 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
     total_nm2 = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + left_nm2
     left_share = left_nm2 / max(total_nm2, 1e-30)
     unexplained = _unexplained(rest, held_nm(left), limits_nm, dataset, left_share)
-    conflict = sum(j.far > limits.SURE for j in effects) >= limits.CONFLICT
     found = sorted(
-        (_cause(solution, j, total_nm2, rest, limits_nm, conflict=conflict) for j in effects),
-        key=lambda x: -x[0].rms_nm,
+        (_cause(solution, j, total_nm2, rest, limits_nm) for j in effects), key=lambda x: -x[0].rms_nm
     )
     causes = [cause for cause, _ in found]
     matter = [cause for cause in causes if cause.matters]
@@ -421,13 +416,7 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
 
 
 def _cause(
-    solution: Solution,
-    j: Judged,
-    total_nm2: float,
-    rest: Unexplained,
-    limits_nm: Mapping[Channel, float],
-    *,
-    conflict: bool,
+    solution: Solution, j: Judged, total_nm2: float, rest: Unexplained, limits_nm: Mapping[Channel, float]
 ) -> tuple[Cause, float]:
     """Return an effect as a cause, and its size in parts of its limit, which is that of the first joint for the sensor."""
     joint = j.present.joint
@@ -437,7 +426,7 @@ def _cause(
     part = size_nm / limits_nm[Channel(of, channel.balance)]
     # no wave looks like a law
     alike = sum(v.energy_nm2 for v in rest.views.get(channel, ()) if v.line is None)
-    grade, doubts = grade_of(j, hidden=math.sqrt(max(alike, 0.0)) > size_nm, conflict=conflict)
+    grade, doubts = grade_of(j, hidden=math.sqrt(max(alike, 0.0)) > size_nm)
     rivals = [e.effect.name + (f" of {joint_text(e.joint)}" if e.joint != joint else "") for e in j.rivals]
     rivals = list(dict.fromkeys(rivals)) if grade == ONE_OF else []
     cause = Cause(

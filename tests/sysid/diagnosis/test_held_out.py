@@ -334,21 +334,3 @@ def test_a_value_at_the_end_of_its_range_is_not_certain(part: float) -> None:
     assert j.held == (part < limits.SCALES[0])
     grade, _ = grade_of(j, hidden=False)
     assert grade == CERTAIN or part < limits.SCALES[0]
-
-
-@pytest.mark.parametrize("third", [1.0, 4.5])
-def test_three_values_that_are_far_off_are_no_data_sheet(third: float) -> None:
-    """Two values may be misprints; three, by 3.5 and more prior deviations each, are another joint, or another law."""
-    friction = replace(ARM.friction, coulomb_nm=third * ARM.friction.coulomb_nm)
-    true = replace(
-        ARM,
-        torque_constant_nm_per_a=0.64 * ARM.torque_constant_nm_per_a,
-        rotor_inertia_kgm2=2.0 * ARM.rotor_inertia_kgm2,
-        friction=friction,
-    )
-    found = diagnose(runs_of(true, 3, 4, Rig(counts=2.0**22)), {1: ARM})
-    names = {"torque_constant", "rotor_inertia"} | ({"coulomb_friction"} if third > 1.0 else set())
-    assert {c.name for c in found.causes if c.matters} == names
-    assert {c.grade for c in found.causes} == {CERTAIN if third == 1.0 else EFFECTIVE}
-    assert found.gain is not None
-    assert found.gain.rmse_after_nm < 0.1 * found.gain.rmse_before_nm, "it predicts all the same"

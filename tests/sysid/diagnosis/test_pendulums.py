@@ -717,9 +717,7 @@ def test_a_grease_that_thins_is_one_rate_of_viscous_and_coulomb_friction() -> No
         runs.append(
             (
                 name,
-                replace(
-                    table, joints={1: replace(columns, current_a=current, temperature_c=25.0 + warmer)}
-                ),
+                replace(table, joints={1: replace(columns, current_a=current, temperature_c=25.0 + warmer)}),
             )
         )
     found = diagnose(runs, {1: ARM})
