@@ -14,7 +14,6 @@ from scipy.stats import sem
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Friction
 from jtqd.sysid.diagnosis import limits, verdict
-from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.evidence import Sets
 from jtqd.sysid.diagnosis.findings import CERTAIN, EFFECTIVE, ONE_OF, Present
 from jtqd.sysid.diagnosis.model import _STATES, Solution
