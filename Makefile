@@ -26,11 +26,10 @@ hidden-effect: $(VENV)/.installed-analysis ## hide an effect in the emulated ben
 test: style ## everything but the tests marked campaign
 	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part. pytest compiles its test_*.py.
 	$(BIN)/python -m compileall -q -j 0 -x '/test_[^/]*$$' daemon drivers estimator models sim_can sysid tests tools validation
-	@$(MAKE) $(LANES) -j2 test-native test-hidden; first=$$?; $(MAKE) $(LANES) -j3 test-guest test-here test-sysid types && exit $$first
+	@$(MAKE) --no-print-directory -k -j2 --output-sync=target test-native test-guest test-hidden test-here test-sysid types
 
-# The native lane sleeps for most of its time, and beside it runs one that only takes the turns that nobody else wants:
-# beside two, processes came late. Then three at once: test-here sleeps, too, and the bench kernel keeps a time of its own.
-LANES := --no-print-directory -k --output-sync=target
+# Two lanes at once, in this order. The native one sleeps for most of its time, and beside it runs one that only takes the
+# turns that nobody else wants: beside two, processes came late. The bench kernel keeps a time of its own.
 BEHIND := nice -n 10
 LEFT_OVER := $(if $(shell chrt --idle 0 echo yes 2>/dev/null),chrt --idle 0,nice -n 19)
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
