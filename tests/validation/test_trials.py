@@ -102,7 +102,7 @@ def test_what_is_recorded_is_what_is_diagnosed(monkeypatch: pytest.MonkeyPatch) 
         read_tables.extend(run.table for run in runs)
         return Findings("no_gap", (), (), (1,))
 
-    monkeypatch.setattr(scores, "diagnosed", instead)
+    monkeypatch.setattr(scores, "diagnose", instead)
     drawn = MeasuredBench().draw(4)
     assert judged(drawn.runs, drawn.joints, PRESETS["workshop"], 9).verdict == "no_gap"
     for table, columns in zip(read_tables, record(drawn.runs, PRESETS["workshop"], 9), strict=True):
@@ -114,7 +114,7 @@ def test_a_traceback_of_the_diagnosis_is_a_result(monkeypatch: pytest.MonkeyPatc
     def instead(runs: Any, joints: Any) -> Findings:
         raise ZeroDivisionError("no runs")
 
-    monkeypatch.setattr(scores, "diagnosed", instead)
+    monkeypatch.setattr(scores, "diagnose", instead)
     drawn = MeasuredBench().draw(4)
     findings = judged(drawn.runs, drawn.joints, PRESETS["full"], 9)
     assert (findings.verdict, findings.reasons) == (REFUSED, ("ZeroDivisionError: no runs",))
