@@ -133,7 +133,8 @@ def _run(name: str, module: str, arguments: list[str]) -> int:
         package = (error.name or "jtqd").partition(".")[0]
         if package == "jtqd":
             raise
-        print(f"jtq {name}: {package} is not installed: pip install 'jtqd[train]'", file=sys.stderr)
+        extra = "train" if package == "torch" else "analysis"
+        print(f"jtq {name}: {package} is not installed: pip install 'jtqd[{extra}]'", file=sys.stderr)
         return 1
     except OSError as error:  # a full disk, a missing directory, a closed pipe
         if not isinstance(error, BrokenPipeError):  # `| head` has what it wanted

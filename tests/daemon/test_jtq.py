@@ -131,9 +131,13 @@ def test_an_option_can_have_a_module_of_its_own(capsys):
 
 
 def test_a_missing_extra_is_one_line_and_a_missing_module_of_ours_is_not(monkeypatch, capsys):
-    monkeypatch.setitem(jtq.COMMANDS, "fit", ("no_such_package.command", ""))
-    assert jtq.main(["fit"]) == 1
-    assert capsys.readouterr().err == "jtq fit: no_such_package is not installed: pip install 'jtqd[train]'\n"
+    for package, extra in (("torch", "train"), ("scipy", "analysis")):
+        monkeypatch.setitem(sys.modules, package, None)
+        monkeypatch.setitem(jtq.COMMANDS, "fit", (f"{package}.command", ""))
+        assert jtq.main(["fit"]) == 1
+        assert (
+            capsys.readouterr().err == f"jtq fit: {package} is not installed: pip install 'jtqd[{extra}]'\n"
+        )
     monkeypatch.setitem(jtq.COMMANDS, "fit", ("jtqd.no_such_module", ""))
     with pytest.raises(ModuleNotFoundError):
         jtq.main(["fit"])
