@@ -82,6 +82,19 @@ def jtq(*arguments: str, runtime: Path) -> tuple[int, dict[str, Any], str]:
     return status, content, reported + ("" if content else printed)
 
 
+def check(*arguments: str, runtime: Path) -> tuple[int, dict[str, Any], str]:
+    """`jtq check` where no jtqd runs: in a process of its own, whose SCHED_FIFO all that pytest starts would inherit."""
+    done = subprocess.run(
+        [sys.executable, "-m", "jtqd.daemon.jtq", "check", *arguments, "--bus", INTERFACE, "--json"],
+        env={**os.environ, "RUNTIME_DIRECTORY": str(runtime)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    return done.returncode, json.loads(done.stdout or "{}"), done.stderr
+
+
 def levels(content: dict[str, Any]) -> dict[str, str]:
     return {each["item"]: each["level"] for each in content["items"]}
 
@@ -161,10 +174,10 @@ while time.monotonic() < until:
 
 
 def test_check_drives_the_bus_where_nobody_else_does(tmp_path: Path, bench: None) -> None:
-    code, seen, _ = jtq("check", "0.2", "--bus", INTERFACE, "--json", runtime=tmp_path)
+    code, seen, _ = check("0.2", runtime=tmp_path)
     assert code == 1, "no SYNC"
     assert levels(seen)["SYNC"] == "FAIL"
-    code, seen, printed = jtq("check", "0.5", "--bus", INTERFACE, "--drive-sync", "--json", runtime=tmp_path)
+    code, seen, printed = check("0.5", "--drive-sync", runtime=tmp_path)
     assert seen, printed
     found = levels(seen)
     assert found["boot"] == "GOOD"
@@ -185,7 +198,7 @@ def test_check_drives_the_bus_where_nobody_else_does(tmp_path: Path, bench: None
     # A foreign SYNC producer: this check does not become the second one.
     with process("-c", FOREIGN_SYNC, INTERFACE):
         time.sleep(0.5)
-        code, _, printed = jtq("check", "1", "--bus", INTERFACE, "--drive-sync", runtime=tmp_path)
+        code, _, printed = check("1", "--drive-sync", runtime=tmp_path)
     assert code == 1
     assert printed.startswith(f"jtq check: another node sends SYNC on {INTERFACE}")
 
