@@ -215,8 +215,8 @@ def combined(parts: Sequence[Findings]) -> Findings:
     experiment of every joint that has one.
     """
     verdict = min((f.verdict for f in parts), key=_WORST_FIRST.index)
-    with_gain = [f for f in parts if f.gain is not None]
-    leading = max(with_gain, key=_fall_nm, default=None)
+    falls = [(f.gain.rmse_before_nm - f.gain.rmse_after_nm, f) for f in parts if f.gain is not None]
+    leading = max(falls, key=lambda fall: fall[0], default=(0.0, None))[1]
     plans = {f.joints[0]: f.next_experiment for f in parts if f.joints and f.next_experiment is not None}
     return Findings(
         verdict,
@@ -242,8 +242,3 @@ def combined(parts: Sequence[Findings]) -> Findings:
         predicts=tuple(p for f in parts for p in f.predicts),
         used=tuple(name for name in parts[0].runs if any(name in f.used_runs for f in parts)),
     )
-
-
-def _fall_nm(findings: Findings) -> float:
-    gain = findings.gain
-    return 0.0 if gain is None else gain.rmse_before_nm - gain.rmse_after_nm

@@ -75,14 +75,15 @@ class Solution:
     """A set with its posterior.
 
     entries: all that competed; chosen: those that are in the set; equations, variances, sets: of the evidence, at the
-    states of the set; runs, disturbed: binned, with discrepancy among the nuisances; own_means: of what each recording has
-    of its own.
+    states of the set; sized: equations of sizes, with noise alone; runs, disturbed: binned, with discrepancy among the
+    nuisances; own_means: of what each recording has of its own.
     """
 
     dataset: Dataset
     entries: list[Entry]
     chosen: Set
     equations: Equations
+    sized: Equations
     variances: Mapping[object, float]
     runs: list[RunData]
     disturbed: list[RunData]
@@ -96,11 +97,11 @@ class Solution:
         its coefficients at these variances; states of the signals stay those of the solution.
         """
         work = self.work.copy()
-        work.settle(chosen, self.equations.sets(variances).fit(chosen).mean, self.noise, variances)
+        work.settle(chosen, self.sized.sets(variances).fit(chosen).mean, self.noise.random, variances)
         self.work.set_states()
-        made = work.equations(self.noise)
+        made = work.equations(self.noise.random)
         return replace(
-            self, equations=made, work=work, entries=work.entries, runs=work.runs, disturbed=work.disturbed
+            self, sized=made, work=work, entries=work.entries, runs=work.runs, disturbed=work.disturbed
         )
 
     def transform(self) -> FloatArray:
@@ -110,13 +111,13 @@ class Solution:
     @cached_property
     def plain(self) -> Sets:
         """Of sizes: what a set explains is the set's, whatever would resemble it."""
-        return self.equations.sets(self.variances, self.chosen, resembling=False)
+        return self.sized.sets(self.variances, self.chosen, resembling=False)
 
     @cached_property
     def covariance(self) -> FloatArray:
         """Of the set's values [q, q], with what calibrations outside of the set may be off by (JCGM 100:2008, type B)."""
         off = [e.prior.calibration and k not in self.chosen for k, e in enumerate(self.entries)]
-        wide = copy(self.equations)
+        wide = copy(self.sized)
         wide.recorded = np.maximum(wide.recorded, np.repeat(off, [e.size for e in self.entries]))
         return wide.sets(self.variances, self.chosen).fit(self.chosen).covariance
 
@@ -218,7 +219,7 @@ def solve(dataset: Dataset) -> Solution:
         best = search.best(starts, rivals=turn + 1 == _TURNS)
         start, variances, means = best.chosen, best.variances, best.means
         residuals = work.left(start, means)
-        work.settle(start, means.beta, noise, variances)
+        work.settle(start, means.beta, noise.random, variances)
     equations = work.equations(noise)  # at the states of the set itself
     variances, _, means = equations.expected(start, variances, _STEPS)
     return Solution(
@@ -226,6 +227,7 @@ def solve(dataset: Dataset) -> Solution:
         work.entries,
         start,
         equations,
+        work.equations(noise.random),
         variances,
         work.runs,
         work.disturbed,

@@ -465,10 +465,18 @@ _BLOCK_S: Final = 1.0
 
 
 class Noise(NamedTuple):
-    """Noise of the channels: standard deviation of each [Nm]; inflation: how many rows count as one, of all."""
+    """Noise of the channels: standard deviation of each [Nm]; inflation: how many rows count as one, of all; repeats: what
+    the equations are exact to, as a variance per row [Nm^2]. It is evidence for no set, and makes no size smaller.
+    """
 
     sigma: Mapping[Channel, float]
     inflation: float
+    repeats: Mapping[Channel, float]
+
+    @property
+    def random(self) -> Noise:
+        """The noise without what repeats."""
+        return self._replace(repeats={})
 
 
 def noise_of_channels(
@@ -485,12 +493,11 @@ def noise_of_channels(
     """
     block = max(1, round(_BLOCK_S / step_s))
     every = {c: np.concatenate(parts) for c, parts in residuals.items()}
-    square = {c: max(float(np.nanmean(x**2)), 1e-24) for c, x in every.items()}
-    slow = [_slowness(parts, math.sqrt(square[c]), block) for c, parts in residuals.items()]
+    sigma = {c: max(float(np.sqrt(np.nanmean(x**2))), 1e-12) for c, x in every.items()}
+    slow = [_slowness(parts, sigma[c], block) for c, parts in residuals.items()]
     inflation = max(1.0, float(np.mean(slow)))
-    repeats = exact_nm**2 / (directions * inflation)
-    bins = {c: int(np.isfinite(x).sum()) for c, x in every.items()}
-    return Noise({c: math.sqrt(x + bins[c] * repeats) for c, x in square.items()}, inflation)
+    each = exact_nm**2 / (directions * inflation)
+    return Noise(sigma, inflation, {c: int(np.isfinite(x).sum()) * each for c, x in every.items()})
 
 
 def _slowness(series: Sequence[FloatArray], sigma: float, block: int) -> float:
@@ -523,7 +530,8 @@ def run_sums(run: RunData, noise: Noise, columns: int, nuisances: int) -> Sums:
     for channel, d in run.channels.items():
         block = np.column_stack((d.regressors, d.nuisances, d.residual))[d.valid]
         places = np.concatenate((d.index, columns + d.families, [width - 1])).astype(np.intp)
-        gram[np.ix_(places, places)] += block.T @ block / (noise.sigma[channel] ** 2 * noise.inflation)
+        variance = noise.sigma[channel] ** 2 + noise.repeats.get(channel, 0.0)
+        gram[np.ix_(places, places)] += block.T @ block / (variance * noise.inflation)
         rows += len(block) / noise.inflation
     return Sums(gram, rows)
 

@@ -57,6 +57,7 @@ class BaseLoss:
     def __init__(self, joint: Joint) -> None:
         self._friction: Final = joint.friction
         self._slope_nm: Final = _SLOPE * joint.rated_torque_nm
+        self.depends_on_load: Final = joint.efficiency is not None
         self._rows: tuple[FloatArray, FloatArray] | None = None
         if joint.efficiency is not None:
             highest = max(DRIVING_CURRENT_MAX_A, 9.0)
@@ -70,11 +71,6 @@ class BaseLoss:
             self._last = table.last_row
             peak = plant_of_joint(joint).joints[0].deviations.stribeck
             self._peak = peak.torque_nm, peak.velocity_rad_s
-
-    @property
-    def depends_on_load(self) -> bool:
-        """Whether the joint file has an efficiency."""
-        return self._rows is not None
 
     def loss(self, torque_nm: FloatArray, velocity_rad_s: FloatArray) -> FloatArray:
         """Return the loss [n] at torque_nm [n] and velocity_rad_s [n]."""

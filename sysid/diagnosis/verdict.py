@@ -106,7 +106,7 @@ def predicted(solution: Solution, chosen: Set) -> Prediction:
     """Return what predicts between a set and the set with all values of the file: what held-out runs want."""
     grams, counts = _grams(solution)
     without = fits_without(solution)
-    wide = chosen | (solution.equations.values - solution.equations.alike(chosen))
+    wide = chosen | (solution.sized.values - solution.sized.alike(chosen))
     part = stacked(grams, without, chosen, wide) if len(grams) > 1 else 0.0
     mixed = [sets.coefficients(chosen) + part * _added(sets, chosen, wide) for sets in without]
     contrasts = [np.append(-mean, 1.0) for mean in mixed[:-1]]
@@ -150,7 +150,7 @@ def without_discrepancy(solution: Solution) -> dict[object, float]:
 
 def fits_without(solution: Solution) -> list[Sets]:
     """Return the sets without each recording in turn, and with all (of one recording: with it); without discrepancy."""
-    *without, everything = solution.equations.marginal(without_discrepancy(solution))
+    *without, everything = solution.sized.marginal(without_discrepancy(solution))
     if len(without) == 1:
         without = [everything]
     return [Sets(solution.entries, gram) for gram in (*without, everything)]
@@ -293,8 +293,9 @@ def judged(solution: Solution) -> list[Judged]:
     imitating = recorder.sets(solution.variances, chosen)
     sizes = Sizes(fits_without(solution), chosen)
     effects = sets.effects(chosen)
-    without = [plain.without(chosen, members) for members in effects]
-    lacks = {rival: plain.lacks(chosen, rival) for rival in without}
+    apart = solution.equations.sets(solution.variances, chosen, resembling=False)
+    without = [apart.without(chosen, members) for members in effects]
+    lacks = {rival: apart.lacks(chosen, rival) for rival in without}
     alike = [chosen, *(rival for rival, lack in lacks.items() if lack <= limits.RIVAL)]
     places = sets.places(chosen)
     out = []

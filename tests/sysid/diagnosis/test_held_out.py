@@ -94,7 +94,7 @@ def with_noise_entry(solution: Solution, signs: tuple[int, ...]) -> tuple[Soluti
         regressors = d.regressors.copy()
         regressors[:, d.index == column] = (sign * noise / float(solution.entries[k].weights[0, 0]))[:, None]
         runs.append(replace(run, channels={MOTOR1: replace(d, regressors=regressors)}))
-    wide = copy(solution.equations)
+    wide = copy(solution.sized)
     wide.grams = wide.grams.copy()
     for gram, sign in zip(wide.grams, signs, strict=True):
         left = np.zeros(len(gram))
@@ -102,7 +102,7 @@ def with_noise_entry(solution: Solution, signs: tuple[int, ...]) -> tuple[Soluti
         turn = np.eye(len(gram))
         turn[:, int(solution.sets.slices[k][0])] = sign * left
         gram[:] = turn.T @ gram @ turn
-    return replace(solution, runs=runs, disturbed=[], equations=wide, chosen=solution.chosen | {k}), k
+    return replace(solution, runs=runs, disturbed=[], sized=wide, chosen=solution.chosen | {k}), k
 
 
 def left_nm2(found: Prediction) -> float:
@@ -281,7 +281,7 @@ def test_what_predicts_is_where_its_own_simulation_is() -> None:
     work = found.work.copy()
     work.move(found.chosen, 0.5 * found.plain.fit(found.chosen).mean, _STATES, None)
     equations = work.equations(found.noise)
-    halved = replace(found, equations=equations, runs=work.runs, disturbed=work.disturbed)
+    halved = replace(found, sized=equations, runs=work.runs, disturbed=work.disturbed)
     there = constant(predicted(halved, found.chosen).effects)
     found.work.set_states()
     assert abs(there / weak.torque_constant_nm_per_a - 1.0) > 0.03, "else this shows nothing"

@@ -31,7 +31,7 @@ def coloured(a: FloatArray, noise: FloatArray) -> FloatArray:
     return out
 
 
-NOISE = Noise({MOTOR1: 0.5, TORSION1: 2.0, MOTOR2: 1.0}, 1.5)
+NOISE = Noise({MOTOR1: 0.5, TORSION1: 2.0, MOTOR2: 1.0}, 1.5, {})
 COUNT, COLUMNS, NUISANCES = 90, 3, 2
 
 
@@ -105,8 +105,12 @@ def test_what_the_equations_are_exact_to_repeats_in_every_bin() -> None:
     """A mean over many bins is no more certain than this, spread over so many directions."""
     for bins in (10_000, 1_000_000):
         noise = noise_of_channels({MOTOR1: [np.tile([1e-3, -1e-3], bins // 2)]}, 0.005, 0.2, 16)
-        variance = noise.sigma[MOTOR1] ** 2 * noise.inflation / bins
-        assert variance == pytest.approx(0.05**2, rel=1e-3)
+        variance = noise.repeats[MOTOR1] * noise.inflation / bins
+        assert variance == pytest.approx(0.05**2, rel=1e-9)
+        run = run_data("run", {MOTOR1: np.ones(2)}, {})
+        weight = run_sums(run, noise, 0, 0).gram[-1, -1] / 2.0
+        assert weight == pytest.approx(1.0 / (bins * 0.05**2), rel=1e-3)
+        assert run_sums(run, noise.random, 0, 0).gram[-1, -1] / 2.0 > 10.0 * weight, "no size is less for it"
     assert noise_of_channels({MOTOR1: [np.full(9, 0.5)]}, 0.005).sigma[MOTOR1] == pytest.approx(0.5)
 
 
