@@ -502,7 +502,7 @@ cdef class FusedEstimator(Estimator):
         cdef FusedState *s = &self.state
         cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
         cdef double scale, view, trusted = 1.0, difference, known = 0.0, early = 1.0, share = 1.0
-        cdef double spread, more, mismatch, variance, unproven, lost, noise, stiffer
+        cdef double spread, more, mismatch, variance, unproven, lost, noise, stiffness
         cdef FusedObserved at
         cdef int status
         cdef bint by_network, standing = out.status == STANDSTILL, alone = not law.fusion.with_torsion
@@ -582,10 +582,12 @@ cdef class FusedEstimator(Estimator):
         if law.tracked and out.status != STANDSTILL:  # measured in motion; of the torsion, by its share
             variance += share * (law.tracking_noise + law.tracking_viscous * v * v / (1.0 + law.tracking_bend * v * v))
         noise = louder_nm2(&law.inputs, &s.inputs)
+        stiffness = local_stiffness(&law.observer, s.observer.d)  # more under load
         if noise > 0.0:
-            stiffer = local_stiffness(&law.observer, s.observer.d) * best.alpha / law.observer.stiffness
-            variance += stiffer * stiffer * noise  # the spring of the torsion may be stiffer under load
-        unproven = unproven_nm2(&law.proof, unproven, best.alpha, s.offsets.now.link_rad, at.ahead_nm)
+            variance += (stiffness * best.alpha / law.observer.stiffness) ** 2 * noise
+        unproven = unproven_nm2(
+            &law.proof, unproven, best.alpha, s.offsets.now.link_rad, share * stiffness * stiffness * at.behind_rad2
+        )
         out.sigma_nm = sqrt(variance + unproven + s.inputs.doubt * s.inputs.doubt)
         publish_within(out, law.limit)
 
@@ -631,7 +633,7 @@ def observe_run(
     fill_fused_observer(&law.observer, joint, torsion, settings)
     restart_guard(&guard)
     n = inputs.shape[1]
-    rows, waves, status = np.full((6, n), NAN), np.full((n, 6), NAN), np.empty(n, np.uint8)
+    rows, waves, status = np.full((7, n), NAN), np.full((n, 6), NAN), np.empty(n, np.uint8)
     cdef const double[:, ::1] x = inputs
     cdef double[:, ::1] to = rows
     cdef double[:, ::1] w = waves
@@ -641,13 +643,13 @@ def observe_run(
             sample = Sample(x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
             if observe_fused(&law.guard, &guard, &law.observer, &state, &sample, &out):
                 to[0, k], to[1, k], to[2, k] = out.raw_nm, out.joint_velocity_rad_s, out.torsion_nm
-                to[3, k], to[4, k], to[5, k] = out.direction, out.open_nm, out.ahead_nm
+                to[3, k], to[4, k], to[5, k], to[6, k] = out.direction, out.open_nm, out.ahead_nm, out.behind_rad2
                 w[k, 0], w[k, 1], w[k, 2], w[k, 3] = out.cos2, out.sin2, out.cos4, out.sin4
                 w[k, 4], w[k, 5] = out.cos1, out.sin1
             s[k] = guard.status
-    raw, v, torsion_nm, direction, open_nm, ahead_nm = rows
+    raw, v, torsion_nm, direction, open_nm, ahead_nm, behind_rad2 = rows
     ripple, turn = np.ascontiguousarray(waves[:, :4]), np.ascontiguousarray(waves[:, 4:])
-    return ObservedRun(status, raw, v, torsion_nm, ripple, inputs[5], direction, inputs[0], open_nm, ahead_nm, turn)
+    return ObservedRun(status, raw, v, torsion_nm, ripple, inputs[5], direction, inputs[0], open_nm, ahead_nm, turn, behind_rad2)
 
 
 # Joints with effects --------------------------------------------------------------------------------------------------

@@ -42,7 +42,7 @@ cdef void restart_proof(const ProofLaw *law, ProofState *s) noexcept nogil
 cdef double prove(
     const ProofLaw *law, ProofState *s, const Fused *fused, const FusedObserved *seen, double dt, bint standing, bint in_order
 ) noexcept nogil
-cdef double unproven_nm2(const ProofLaw *law, double unproven, double alpha, double link_rad, double ahead_nm) noexcept nogil
+cdef double unproven_nm2(const ProofLaw *law, double unproven, double alpha, double link_rad, double behind_nm2) noexcept nogil
 
 cdef class Fusion:
     cdef FusionLaw law

@@ -73,6 +73,7 @@ def track_run(
     slope: FloatArray,
     stiffness: FloatArray,
     ahead_nm: FloatArray,
+    behind_nm2: FloatArray,
     resting: BoolArray,
     tracked: bool = True,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]: ...

@@ -27,6 +27,7 @@ cdef struct Inputs:  # of the filter: u = i Kt + J g w, v, deflection d, waves, 
 cdef struct FusedObserved:  # as Observed, and the filtered waves; open: half width of the slip's bounds, 0 once it is known
     double raw_nm, joint_velocity_rad_s, link_velocity_rad_s, torsion_nm
     double cos1, sin1, cos2, sin2, cos4, sin4, direction, open_nm, ahead_nm  # ahead: torsion through its own filter, less torsion_nm
+    double behind_rad2  # product of what the tracking filter leaves of this deflection and the last; 0 without it
 
 cdef struct Reference:  # of a sensor, delayed like the estimate
     double last, z, since, settled

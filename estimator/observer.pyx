@@ -454,7 +454,8 @@ cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const 
     s.z.u = filtered(&h, s.z.u, now.u, s.last.u)
     s.z.v = filtered(&h, s.z.v, now.v, s.last.v)
     cdef Hold own
-    cdef double damped
+    cdef double damped, behind = s.last.d - s.z.d
+    out.behind_rad2 = 0.0
     if law.tracking > 0.0:
         s.z.d = _track(
             &s.track,
@@ -465,6 +466,7 @@ cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const 
             now.sin2 * s.last.cos2 - now.cos2 * s.last.sin2,
             now.d,
         )
+        out.behind_rad2 = behind * (now.d - s.z.d)
         s.d_rate = _track_rate(&s.track, x.motor_velocity_rad_s)
         s.d_moved = (now.d - s.last.d) / x.dt_s
         damped = law.damping * s.d_rate

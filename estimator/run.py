@@ -189,7 +189,8 @@ class ObservedRun:
     the motor angle; temperature [n], NaN where unknown; direction [n], -1 to 1; dt_s [n], time since the sample before;
     open_nm [n]: what the torsion's slip leaves open to either side; ahead_nm [n]: the torsion that went through its own
     filter only, less torsion_nm, which is as old as raw_nm; turn [n, 2]: filtered cos and sin of the motor angle, [0, 2]
-    where they are not known.
+    where they are not known; behind_rad2 [n]: product of what the tracking filter leaves of this deflection and the last, 0
+    without it, [0] where it is not known.
     """
 
     status: StatusArray
@@ -203,6 +204,7 @@ class ObservedRun:
     open_nm: FloatArray
     ahead_nm: FloatArray
     turn: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    behind_rad2: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True)

@@ -112,7 +112,7 @@ class PathResiduals(NamedTuple):
     tracked, delayed, low_pass: errors of the tracked torsion, of that through the motor path's filter, and of the torsion
     through the low pass of new configurations, against the unfiltered sensor: for `fused.tracking`.
     loss_nm, turn [n, 6] (filtered cos and sin of 1, 2 and 4 times the motor angle): for `fused.agreement.turn`.
-    ahead: of the tracked torsion to the delayed one. resting: standing. counted: in motion, and settled.
+    ahead, behind: of the tracked torsion to the delayed one, to the readings. resting: standing. counted: moving, settled.
     now: the current path is no older than the tracked torsion; empty: it is, by the motor path's filter.
     """
 
@@ -134,6 +134,7 @@ class PathResiduals(NamedTuple):
     turn: FloatArray = NONE
     teacher_nm: FloatArray = NONE
     ahead_nm: FloatArray = NONE
+    behind_nm2: FloatArray = NONE
     resting: BoolArray = NEVER
     counted: BoolArray = NEVER
     now: BoolArray = NEVER
@@ -190,7 +191,8 @@ def path_residuals(
     tau, open_nm = (each[keep] for each in torsion_torque(torsion, run))
     direction = seen.direction[keep]
     more, _ = AdditiveLossModel(loss).loss_many(raw + SLOPE_NM, velocity, seen.temperature_c[keep], direction)
-    tracked = tracked_torque(torsion, run) - run.raw_sensor_nm
+    tracked, behind = tracked_torque(torsion, run)
+    tracked -= run.raw_sensor_nm
     delayed = low_pass(tracked, seen.dt_s, run.bandwidth_rad_s)
     return PathResiduals(
         raw,
@@ -211,6 +213,7 @@ def path_residuals(
         turn=np.column_stack((seen.turn, seen.waves))[keep],
         teacher_nm=teacher,
         ahead_nm=(tracked + run.raw_sensor_nm - delayed)[keep] - sensor,
+        behind_nm2=behind[keep],
         resting=seen.status[keep] == STANDSTILL,
     )
 
@@ -257,6 +260,7 @@ def fused_errors(
     rated_nm None, or a joint without torsion: nothing is learned in the run, and nothing widens the spread.
     """
     none = torsion = current = more = known = np.zeros(len(run.raw_nm))
+    tracks = fused.tracking is not None and len(run.ahead_nm) > 0
     if rated_nm is None or fused.torsion is None or not len(run.dt_s):
         fusion = Fusion(replace(fused.sigma, reference_nm=0.0), fused.torsion is not None)
         alpha, _, spread, _ = fusion.fuse(*run.fusion_inputs)
@@ -270,7 +274,7 @@ def fused_errors(
             run.direction,
             run.slope,
             run.stiffness_nm_per_rad,
-            run.ahead_nm if fused.tracking is not None and len(run.ahead_nm) else none,
+            *((run.ahead_nm, run.behind_nm2) if tracks else (none, none)),
             run.resting if len(run.resting) else none > 0.0,
             track_zeros,
         )

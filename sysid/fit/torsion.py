@@ -96,17 +96,13 @@ def torsion_torque(torsion: Torsion, run: RunSignals) -> tuple[FloatArray, Float
     return _torque(torsion, d, deflection_rate(d, run))
 
 
-def tracked_torque(torsion: Torsion, run: RunSignals) -> FloatArray:
-    """Return tau_t [n] of the tracking filter, without delay."""
-    d, rate = tracked(
-        _unfiltered_deflection(torsion, run),
-        run.motor_position_rad,
-        run.motor_velocity_rad_s,
-        run.seen.dt_s,
-        TRACKING_RAD_S,
-        WAVE_RAD_S,
-    )
-    return _torque(torsion, d, rate)[0]
+def tracked_torque(torsion: Torsion, run: RunSignals) -> tuple[FloatArray, FloatArray]:
+    """Return tau_t [n] of the tracking filter, without delay, and what it leaves of two readings in a row [n, Nm^2]."""
+    read = _unfiltered_deflection(torsion, run)
+    motor = run.motor_position_rad, run.motor_velocity_rad_s
+    d, rate = tracked(read, *motor, run.seen.dt_s, TRACKING_RAD_S, WAVE_RAD_S)
+    left = local_stiffness(torsion, d) * (read - d)
+    return _torque(torsion, d, rate)[0], left * np.append(0.0, left[:-1])
 
 
 def low_pass_torque(torsion: Torsion, run: RunSignals) -> FloatArray:

@@ -315,6 +315,7 @@ def _paths(run: PathRun, inputs: FloatArray, trained: Trained, joint: Joint) -> 
         turn=inputs[:, _TURN],
         teacher_nm=none,
         ahead_nm=none,
+        behind_nm2=none,
         resting=seen.status == STANDSTILL,
         now=none == 0.0,
         counted=(seen.status == VALID) & (time_s[keep] - time_s[0] >= SETTLE_S),

@@ -68,10 +68,11 @@ def held(found: EstimateRun, at: slice) -> bool:
 
 
 def unproven_nm2(given: Inputs) -> tuple[slice, FloatArray]:
-    """Last rest, and what sigma^2 has there of the torsion that nothing has proven [n]: (share U/3)^2 + (ahead/20)^2.
+    """Last rest, and what sigma^2 has there of the torsion that nothing has proven [n]: (share U/3)^2 + K^2 r r'.
 
     U: range of the torsion since the stop, or of the torsion less the motor's torque where that is less, if it is above
-    2.5 % of the rated torque; at most what the current path allows; at each sample with what the torsion is ahead by.
+    2.5 % of the rated torque; at most what the current path allows; at each sample with what the torsion is ahead by. r, r':
+    what the tracking filter leaves of this reading and the last, where both share it.
     """
     fused, n = JOINT.fused, len(given.true_nm)
     assert fused is not None
@@ -100,7 +101,10 @@ def unproven_nm2(given: Inputs) -> tuple[slice, FloatArray]:
     for k in range(1, len(off)):
         off[k] = min(max(off[k - 1], off[k]), most[k])
     off = np.maximum(off, np.minimum(least(ahead), most + np.abs(ahead)))
-    return rest, (paths.alpha * off / 3.0) ** 2 + (0.05 * ahead) ** 2
+    stiffness = (
+        fused.torsion.stiffness_nm_per_rad + 3.0 * fused.torsion.cubic_nm_per_rad3 * (torsion / 12e3) ** 2
+    )
+    return rest, (paths.alpha * off / 3.0) ** 2 + stiffness**2 * np.maximum(seen.behind_rad2[rest], 0.0)
 
 
 def test_healthy_inputs_at_rest_are_in_doubt_by_what_the_load_has_changed_by_unseen() -> None:

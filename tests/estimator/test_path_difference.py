@@ -304,7 +304,7 @@ def test_fits_see_what_the_loop_does() -> None:
     fusion = Fusion(both.fused.sigma, True)
     signals = (half_dt, torsion - (raw - loss), s, v, torsion, fusion.fuse(*parts).variance_nm2, slope)
     none = np.zeros(len(raw))
-    whole = (half_dt, *parts, signals[1], s, slope, none + K, none, none > 0.0)
+    whole = (half_dt, *parts, signals[1], s, slope, none + K, none, none, none > 0.0)
     _, taken, *_, known = track_run(both.fused, both.rated_torque_nm, *whole)
     slow, fast, gain, left, _ = (each[-1] for each in levels(both.fused, both.rated_torque_nm, *signals))
 
@@ -338,20 +338,28 @@ def run_of(v: FloatArray, difference_nm: FloatArray, torsion_nm: FloatArray) -> 
         none,
         K + none,
         none,
+        none,
         none > 0.0,
     )
 
 
 def test_what_the_torsion_is_ahead_by_counts_whole_until_it_is_proven() -> None:
-    """3 Nm ahead, a bound of three standard deviations, as the rest of U; afterwards a twentieth."""
+    """3 Nm ahead, a bound of three standard deviations, as the rest of U."""
     assert USUAL.fused is not None
     run = run_of(np.full(3000, 1.0), np.zeros(3000), np.full(3000, 5.0))
     alpha, *_, more, _ = track_run(USUAL.fused, USUAL.rated_torque_nm, *run, False)
-    ahead = (*run[:10], run[10] + 3.0, run[11])
-    wider = track_run(USUAL.fused, USUAL.rated_torque_nm, *ahead, False)[4]
-    bound = (wider[0] - (0.05 * 3.0) ** 2) ** 0.5 - more[0] ** 0.5
-    assert bound == pytest.approx(alpha[0] * 3.0 / 3.0, rel=1e-3)
-    assert wider[-1] - more[-1] == pytest.approx((0.05 * 3.0) ** 2, rel=1e-3)
+    wider = track_run(USUAL.fused, USUAL.rated_torque_nm, *run[:10], run[10] + 3.0, *run[11:], False)[4]
+    assert wider[0] ** 0.5 - more[0] ** 0.5 == pytest.approx(alpha[0] * 3.0 / 3.0, rel=1e-3)
+    assert wider[-1] == pytest.approx(more[-1], abs=1e-6)
+
+
+def test_what_the_tracking_filter_leaves_of_two_readings_is_added_where_both_share_it() -> None:
+    assert USUAL.fused is not None
+    run = run_of(np.full(300, 1.0), np.zeros(300), np.full(300, 5.0))
+    *_, more, _ = track_run(USUAL.fused, USUAL.rated_torque_nm, *run, False)
+    left = np.where(np.arange(300) % 2, 0.49, -0.25)
+    wider = track_run(USUAL.fused, USUAL.rated_torque_nm, *run[:11], left, run[12], False)[4]
+    np.testing.assert_allclose(wider - more, np.maximum(left, 0.0), atol=1e-12)
 
 
 def test_what_is_not_yet_taken_off_is_not_known() -> None:

@@ -285,28 +285,29 @@ def fit_of_days() -> FusedFit:
 def test_runs_of_other_days_are_as_wrong_as_sigma(fit_of_days: FusedFit) -> None:
     """Other motions, eight other days with their offsets and friction: each day 0.5 Nm RMS of up to 30 Nm.
 
-    Against the true torque, without the sensor's offset. 80 % or more of all moving samples are in the 90 % interval (eight
-    days are few), 95 % of the standing ones in theirs.
+    As in service, against the true torque of now, without the sensor's offset. 85 % or more of all moving samples are in the
+    90 % interval (eight days are few); where the joint stands sigma is a bound, and no error is a tenth beyond it.
     """
     ours = replace(joint(1), fused=fit_of_days.fused)
-    moving_inside, standing_inside = [], []
+    moving_inside, standing, sigmas = [], [], []
     for day in range(8):
         motion = harmonic(1.2 + 0.2 * day, 0.4 + 0.05 * day, (3.0, -3.0, 1.5, -1.5)[day % 4])
         made = emulate(campaign_plant(), motion, 4.0, 55 + day, day=day)
         table = made.table
-        run = estimate_columns(ours, FUSED, None, table.time_s, table.joints[1])
-        true = low_pass(made.joint_torque_nm[:, 0], table.dt_s, 200.0)
+        run = estimate_columns(ours, recommended("fused"), None, table.time_s, table.joints[1])
+        true = made.joint_torque_nm[:, 0]
         error = run.torque_nm - true
         moving = (run.status == st.VALID) & (table.time_s > 0.2)
-        standing = (run.status == st.STANDSTILL) & (table.time_s > 0.2)
+        stands = (run.status == st.STANDSTILL) & (table.time_s > 0.2)
         assert np.ptp(true) > 15.0
         assert np.sqrt(np.mean(error[moving] ** 2)) < 0.5
-        assert np.mean(run.sigma_nm[moving]) < 0.5
+        sigmas.append(np.mean(run.sigma_nm[moving]))
         moving_inside.append(np.mean(np.abs(error[moving]) <= 1.645 * run.sigma_nm[moving]))
-        standing_inside.append(np.mean(np.abs(error[standing]) <= run.sigma_nm[standing]))
-    print("inside, by day:", np.round(moving_inside, 2), np.round(standing_inside, 2))
-    assert np.mean(moving_inside) > 0.8
-    assert np.mean(standing_inside) > 0.95
+        standing.append(np.max(np.abs(error[stands]) / run.sigma_nm[stands]))
+    print("inside, by day:", np.round(moving_inside, 2), "standing, sigma:", np.round(standing, 2))
+    assert np.mean(sigmas) < 0.25
+    assert np.mean(moving_inside) > 0.85
+    assert np.max(standing) < 1.1
 
 
 # Reversal ----------------------------------------------------------------------------------------------

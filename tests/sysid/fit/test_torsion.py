@@ -26,6 +26,7 @@ from jtqd.sysid.fit.torsion import (
     TorsionError,
     extended,
     fit_torsion,
+    local_stiffness,
     low_pass_torque,
     torsion_torque,
     tracked_torque,
@@ -202,9 +203,14 @@ def test_the_torque_without_delay_is_the_estimators(tracked: bool) -> None:
     settings = EstimatorSettings(method="fused", track_torsion=True)
     if not tracked:
         settings = EstimatorSettings(method="fused", torsion_bandwidth_rad_s=TORSION_BANDWIDTH_RAD_S)
-    found = tracked_torque(torsion, run) if tracked else low_pass_torque(torsion, run)
+    found, behind = (
+        tracked_torque(torsion, run) if tracked else (low_pass_torque(torsion, run), np.zeros(len(inputs[0])))
+    )
     seen = observe_run(joint, settings, torsion, *inputs)
     np.testing.assert_allclose(found[300:], (seen.torsion_nm + seen.ahead_nm)[300:], atol=1e-6)
+    stiffness = local_stiffness(torsion, (seen.torsion_nm + seen.ahead_nm) / torsion.stiffness_nm_per_rad)
+    np.testing.assert_allclose(behind[300:], (stiffness**2 * seen.behind_rad2)[300:], rtol=0.4, atol=1e-9)
+    assert bool(behind.any()) == tracked
 
 
 # Extensions --------------------------------------------------------------------------------------------
