@@ -32,7 +32,7 @@ the same sample. A step of a reading is in order where it continues the last ste
     off    += step beyond that; a reading that steps back brings it back to 0
     unseen  = sum of omega_m dt while the reading stands still; link encoder: or what the current has changed by
     slipped = range, over RANGE_S, of sum(theta_m(k) - theta_m(k-1) - omega_m dt (1 + scale) - lag (omega_m dt less the last)), beyond
-              MISFIT of what the velocity lags by, NOISE_SIGMAS times what is usual, and LEAST_SLIPPED tolerances
+              max(NOISE_SIGMAS times what is usual in motion, LEAST_SLIPPED tolerances) and lag^2 times the acceleration over it
     longer  = samples by which a run of equal ones at rest is longer than healthy noise gives with exp(-RARE); their mean
               is that of runs at rest, of channels that have been noisy
     doubt   = max(|off|, |unseen|) - TOLERANCE, slipped, or LOAD_HZ longer dt: how far the fastest load may have gone
@@ -42,9 +42,10 @@ Of white noise, and of counts that are passed quickly, a second difference has s
 because both encoders have it. The noise is learned from steps in order. After STRANGE samples out of order `off` is the sum of
 noise, and fades. In motion it is bounded by what the current path leaves possible.
 
-A drive's velocity is its position behind a filter, to first order a lag; lag and scale are those of least squares over the
-motion so far. What no step shows, the sum does: counts that are lost, an angle error, data of before. A velocity that is wrong counts
-as well, as it is not known which of the two is. On four emulated plants the range is at most 0.004 Nm in health.
+A drive's velocity is its position behind a filter, to first order a lag, to second order at most lag^2; lag and scale are those of
+least squares over the motion in order so far, from a squared tolerance of changes on. What no step shows, the sum does: counts that
+are lost, an angle error, data of before. A velocity that is wrong counts as well, as it is not known which of the two is. On four
+emulated plants the range is at most 0.004 Nm in health.
 
 **Contacts**: a sudden external torque on the link, from the link's momentum. Figures and limits: docs/estimator.md.
 
@@ -250,10 +251,7 @@ cdef double STRANGE_S = 0.5, UNKNOWN_RATE = 1.0 / 0.05
 cdef double STRANGE = 20.0  # samples out of order, of the last STRANGE_S: the sum of their steps is no displacement
 cdef double MOST = 100.0  # rated torques: no doubt is larger
 cdef double UNSEEN = 2.5, LONGER = 4.0  # tolerances, samples: beyond what healthy inputs come to
-cdef double RANGE_S = 0.1, MISFIT = 0.1, LEAST_SLIPPED = 0.25  # [s]; part of what a velocity is behind that no lag explains; tolerances
-# squared tolerances: sums of changes and steps of the velocity from which its lag and scale are known; of changes, in which they are forgotten
-cdef double KNOWN = 0.5, KNOWN_STEPS = 1000.0, CHANGES = 100.0
-cdef double LOUDER_S = 20.0, WARY = 0.01  # in which what is healthy grows; weight of what is learned while something is out of order
+cdef double RANGE_S = 0.1, LEAST_SLIPPED = 0.25  # [s]; tolerances: with one, a motor position held for 5 cycles is 3.1 Nm off
 cdef double CALM = 0.1  # samples out of order, of the last STRANGE_S
 cdef double FOLLOW_RATE = 50.0  # at which the torque follows the current
 # logarithms of how rarely healthy noise gives so long a run of equal samples, of a joint's inputs and of its link encoder alone
@@ -326,30 +324,29 @@ cdef double _range(Range *r, double x, double part) noexcept nogil:
 
 
 cdef double _slipped(
-    const InputLaw *law, Slip *s, double slip, double expected, double faster, double limit, double least, double dt, bint calm
+    const InputLaw *law, Slip *s, double slip, double expected, double faster, double limit, double count, double dt, bint calm
 ) noexcept nogil:
     """Take what the motor's position moved beyond its velocity [Nm]; return by how much its range is beyond healthy ones [Nm].
 
-    expected, faster: as `_channel`; limit: of what one sample counts; least: range that is always in order.
+    expected, faster, calm: as `_channel`; limit: of what one sample counts; count: of the motor's position.
     """
-    cdef double part = min(dt / RANGE_S, 1.0), range, misfit, square = law.tolerance * law.tolerance, new = 1.0
-    cdef bint known = s.changes > KNOWN * square and s.steps > KNOWN_STEPS * square
-    cdef double rest = slip - s.scale * expected - s.lag * faster
-    s.sum += max(-limit, min(rest, limit))
+    cdef double part = min(dt / RANGE_S, 1.0), square = law.tolerance * law.tolerance, range, slipped = 0.0
+    s.sum += max(-limit, min(slip - s.scale * expected - s.lag * faster, limit))
     range = _range(&s.range, s.sum, part)
-    misfit = MISFIT * fabs(s.lag) * _range(&s.velocity, expected, part)
-    if known:
-        new = 1.0 if calm and fabs(rest) <= least else WARY
-        s.usual += (range * range - s.usual) * min(new * dt / (LOUDER_S if range * range > s.usual else NOISE_S), 1.0)
-    part = 1.0 - min(new * faster * faster / (CHANGES * square), 1.0)
-    s.by_change, s.changes = s.by_change * part + new * slip * faster, s.changes * part + new * faster * faster
-    s.by_step, s.steps = s.by_step * part + new * slip * expected, s.steps * part + new * expected * expected
-    s.both = s.both * part + new * faster * expected
+    part *= s.lag * s.lag * _range(&s.velocity, expected, part)
+    if s.changes > square:
+        slipped = max(range - part - max(NOISE_SIGMAS * sqrt(s.usual), LEAST_SLIPPED * law.tolerance, count), 0.0)
+        if calm and slipped == 0.0 and fabs(expected) > count:
+            s.usual += (range * range - s.usual) * min(dt / NOISE_S, 1.0)
+    if not calm or slipped > 0.0:
+        return slipped
+    s.by_change, s.changes = s.by_change + slip * faster, s.changes + faster * faster
+    s.by_step, s.steps, s.both = s.by_step + slip * expected, s.steps + expected * expected, s.both + faster * expected
     part = s.changes * s.steps - s.both * s.both
     if part > 0.0:
         s.lag = (s.by_change * s.steps - s.by_step * s.both) / part
         s.scale = (s.by_step * s.changes - s.by_change * s.both) / part
-    return max(range - misfit - max(NOISE_SIGMAS * sqrt(s.usual), least), 0.0) if known else 0.0
+    return 0.0
 
 
 cdef double _too_long(Runs *r, bint equal, bint standing, double rare) noexcept nogil:
@@ -395,7 +392,7 @@ cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint
     if fabs(dt - s.dt) <= UNEVEN * dt:
         slipped = _slipped(
             law, &s.slip, step - expected, expected, faster, INFINITY if isnan(bend) else law.acceleration * dt * dt,
-            max(LEAST_SLIPPED * law.tolerance, COUNTS * s.motor.quantum), dt, calm
+            COUNTS * s.motor.quantum, dt, calm
         )
     doubt = max(doubt, _channel(&s.link, link, expected, faster, law.acceleration, dt, calm, &other))
     if link_still:

@@ -126,7 +126,7 @@ class Zeros(NamedTuple):
         )
 
 
-PAST_LAYOUT: Final = 15
+PAST_LAYOUT: Final = 16
 """Number of the layout of `past`, which logs hold: another one where its fields, their order or their meaning change.
 `tests/estimator/test_path_difference.py` has the size that belongs to it."""
 
