@@ -85,7 +85,7 @@ cdef struct InputState:
     double still_nm  # current [Nm] when the link's reading began to stand still
     Runs runs, link_runs  # of samples that are equal as a whole, and of equal readings of the link
     double noise  # variance of the twist's second differences
-    bint going
+    bint going, alive  # alive: has differed since it began, or need not
 
 cdef int fill_inputs(InputLaw *law, joint, torsion, double noise) except -1
 cdef void restart_inputs(const InputLaw *law, InputState *s) noexcept nogil

@@ -34,7 +34,7 @@ the same sample. A step of a reading is in order where it continues the last ste
     slipped = range, over RANGE_S, of sum(theta_m(k) - theta_m(k-1) - omega_m dt (1 + scale) - lag (omega_m dt less the last)), beyond
               max(NOISE_SIGMAS times what is usual in motion, LEAST_SLIPPED tolerances) and lag^2 times the acceleration over it
     longer  = samples by which a run of equal ones at rest is longer than healthy noise gives with exp(-RARE); their mean
-              is that of runs at rest, of channels that have been noisy
+              is that of runs at rest, of channels that have been noisy. After a gap these are alive when a sample has differed
     doubt   = max(|off|, |unseen|) - TOLERANCE, slipped, or LOAD_HZ longer dt: how far the fastest load may have gone
     louder  = mean square of the second differences of theta_m/G - theta_l, by 6, less SURELY times what the file's sigma has
 
@@ -384,8 +384,11 @@ cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint
         s.still_nm = current
         s.link_runs.still = s.runs.still = 0
         s.motor.unseen = s.link.unseen = 0.0
+        s.alive = s.runs.seen < KNOWN_RUNS
         return
-    equal = link_still and motor == s.motor.last and x.current_a == s.current and expected == s.velocity
+    equal = link_still and motor == s.motor.last and x.current_a == s.current
+    s.alive = s.alive or not equal
+    equal = equal and expected == s.velocity
     if link_still and s.link.step != 0.0:
         s.still_nm = current
     doubt = _channel(&s.motor, motor, expected, faster, law.acceleration, dt, calm, &bend)

@@ -430,6 +430,8 @@ cdef class FusedEstimator(Estimator):
             )
             out.torque_rate_nm_s, out.load_nm = link.rate_nm_s, link.load_nm
             self.estimate(&seen, x, network_wanted, out)
+            if self.law.inputs.used and not self.state.inputs.alive:
+                no_values(out, STARTING)
         else:
             self.state.half = 0.0
             restart_proof(&self.law.proof, &self.state.proof)

@@ -283,3 +283,23 @@ def test_an_encoder_that_has_slipped_is_learned() -> None:
     found = estimated(given._replace(link_rad=link))
     error = np.abs(found.torque_nm - given.true_nm)
     assert np.median(error[7500:]) < 0.4 * 2.5e-4 * JOINT.stiffness_nm_per_rad
+
+
+@pytest.mark.parametrize("gap", [60, 300])
+def test_what_comes_after_a_gap_is_no_torque_before_it_is_seen_to_be_alive(gap: int) -> None:
+    """A joint at rest, whose load swings on, sends the same bytes again: nothing of it proves a torque."""
+    given, n = inputs(), 4500 - AT
+    last = [np.append(each[:AT], each[AT + gap :]) for each in given[:4]]
+    dt = np.full(4500 - gap, 1e-3)
+    dt[AT] = 1e-3 * (gap + 1)
+    healthy = make_estimator(JOINT, recommended("fused")).run(dt, *last, np.full(len(dt), 25.0))
+    assert healthy.status[AT] == st.STARTING
+    assert set(healthy.status[AT + 5 :].tolist()) == {st.STANDSTILL}
+    frozen = [np.append(each[:AT], np.full(n - gap, each[AT + gap])) for each in given[:4]]
+    found = make_estimator(JOINT, recommended("fused")).run(dt, *frozen, np.full(len(dt), 25.0))
+    assert set(found.status[AT:].tolist()) == {st.STARTING}
+    assert np.isnan(found.torque_nm[AT:]).all()
+    frozen[0][AT + 100 :] += 0.01
+    found = make_estimator(JOINT, recommended("fused")).run(dt, *frozen, np.full(len(dt), 25.0))
+    assert set(found.status[AT : AT + 100].tolist()) == {st.STARTING}
+    assert np.isfinite(found.torque_nm[AT + 100])
