@@ -246,11 +246,9 @@ class JointSignals:
 
     def followed(self, angle: FloatArray) -> FloatArray:
         """Return what of a twist [n] the link's acceleration has less than the motor's."""
-        return (
-            angle
-            if self.torsion_nm is None
-            else below(angle, self.step_s, _followed_hz(self.joint, self.torque_hz))
-        )
+        if self.torsion_nm is None:
+            return angle
+        return below(angle, self.step_s, _followed_hz(self.joint, self.torque_hz))
 
     def highest_order(self) -> FloatArray:
         """Return the order of the motor whose wave is as quick as what these balances hold, at each sample [n]."""
