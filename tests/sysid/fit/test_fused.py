@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import AdditiveLoss, Friction, Joint, Tracking
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.settings import bandwidth_of, recommended
+from jtqd.estimator.settings import EstimatorSettings, bandwidth_of, recommended
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, Push, emulate, emulate_run
 from jtqd.sim_can.plant import joint_friction
@@ -282,32 +283,67 @@ def fit_of_days() -> FusedFit:
     return fit_fused([emulated(3000 + k, 6.0, day=100 + k)[0] for k in range(12)], joint(1))
 
 
-def test_runs_of_other_days_are_as_wrong_as_sigma(fit_of_days: FusedFit) -> None:
-    """Other motions, eight other days with their offsets and friction: each day 0.5 Nm RMS of up to 30 Nm.
+class OfDay(NamedTuple):
+    """Of one day: rms error and mean sigma in motion [Nm], share inside the 90 % interval, errors over sigma at rest [n]."""
 
-    As in service, against the true torque of now, without the sensor's offset. 85 % or more of all moving samples are in the
-    90 % interval (eight days are few); where the joint stands sigma is a bound, and no error is a tenth beyond it.
+    rms_nm: float
+    sigma_nm: float
+    inside: float
+    standing: FloatArray
+
+
+def other_days(fit: FusedFit, settings: EstimatorSettings, delay_rad_s: float | None = None) -> list[OfDay]:
+    """Other motions, eight other days with their offsets and friction, against the true torque without the sensor's offset.
+
+    delay_rad_s: of the low pass that the true torque is as old as; None: that of now.
     """
-    ours = replace(joint(1), fused=fit_of_days.fused)
-    moving_inside, standing, sigmas = [], [], []
+    ours, found = replace(joint(1), fused=fit.fused), []
     for day in range(8):
         motion = harmonic(1.2 + 0.2 * day, 0.4 + 0.05 * day, (3.0, -3.0, 1.5, -1.5)[day % 4])
         made = emulate(campaign_plant(), motion, 4.0, 55 + day, day=day)
         table = made.table
-        run = estimate_columns(ours, recommended("fused"), None, table.time_s, table.joints[1])
+        run = estimate_columns(ours, settings, None, table.time_s, table.joints[1])
         true = made.joint_torque_nm[:, 0]
-        error = run.torque_nm - true
-        moving = (run.status == st.VALID) & (table.time_s > 0.2)
-        stands = (run.status == st.STANDSTILL) & (table.time_s > 0.2)
         assert np.ptp(true) > 15.0
-        assert np.sqrt(np.mean(error[moving] ** 2)) < 0.5
-        sigmas.append(np.mean(run.sigma_nm[moving]))
-        moving_inside.append(np.mean(np.abs(error[moving]) <= 1.645 * run.sigma_nm[moving]))
-        standing.append(np.max(np.abs(error[stands]) / run.sigma_nm[stands]))
-    print("inside, by day:", np.round(moving_inside, 2), "standing, sigma:", np.round(standing, 2))
-    assert np.mean(sigmas) < 0.25
-    assert np.mean(moving_inside) > 0.85
-    assert np.max(standing) < 1.1
+        error = run.torque_nm - (true if delay_rad_s is None else low_pass(true, table.dt_s, delay_rad_s))
+        moving = (run.status == st.VALID) & (table.time_s > 0.2)
+        standing = (run.status == st.STANDSTILL) & (table.time_s > 0.2)
+        found.append(
+            OfDay(
+                float(np.sqrt(np.mean(error[moving] ** 2))),
+                float(np.mean(run.sigma_nm[moving])),
+                float(np.mean(np.abs(error[moving]) <= 1.645 * run.sigma_nm[moving])),
+                np.abs(error[standing]) / run.sigma_nm[standing],
+            )
+        )
+    return found
+
+
+def test_runs_of_other_days_are_as_wrong_as_sigma(fit_of_days: FusedFit) -> None:
+    """Each day 0.5 Nm RMS of up to 30 Nm; 95 % of the standing samples are in their interval."""
+    days = other_days(fit_of_days, FUSED, 200.0)
+    assert max(day.rms_nm for day in days) < 0.5
+    assert max(day.sigma_nm for day in days) < 0.5
+    assert np.mean([np.mean(day.standing <= 1.0) for day in days]) > 0.95
+
+
+@pytest.mark.xfail(
+    strict=True, reason="0.798: sigma is calibrated for a torsion that is tracked, this one is not"
+)
+def test_without_a_tracking_filter_four_of_five_samples_are_in_the_90_percent_interval(
+    fit_of_days: FusedFit,
+) -> None:
+    """Of a day on the average; eight days are few."""
+    assert np.mean([day.inside for day in other_days(fit_of_days, FUSED, 200.0)]) > 0.8
+
+
+def test_runs_of_other_days_in_service_are_as_wrong_as_sigma(fit_of_days: FusedFit) -> None:
+    """Without delay 85 % are in the 90 % interval; where the joint stands sigma is a bound, and none is a tenth beyond."""
+    days = other_days(fit_of_days, recommended("fused"))
+    assert max(day.rms_nm for day in days) < 0.5
+    assert np.mean([day.sigma_nm for day in days]) < 0.25
+    assert np.mean([day.inside for day in days]) > 0.85
+    assert max(day.standing.max() for day in days) < 1.1
 
 
 # Reversal ----------------------------------------------------------------------------------------------
