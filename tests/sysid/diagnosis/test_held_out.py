@@ -59,6 +59,19 @@ def test_the_set_predicts_with_values_of_the_file_that_change(solution: Solution
     assert constant == pytest.approx(ARM.torque_constant_nm_per_a, rel=0.02)
 
 
+def test_sizes_are_of_the_noise_alone(solution: Solution) -> None:
+    """What the equations are exact to makes evidence weigh less, and widens no interval."""
+    noise = solution.noise
+    assert all(noise.repeats[c] > 0.0 for c in noise.sigma)
+    more = noise._replace(repeats={c: 10.0 * x for c, x in noise.repeats.items()})
+    assert solution.work.equations(more).grams[0][0, 0] < solution.equations.grams[0][0, 0]
+    own = solution.work.equations(noise.random).grams
+    for found, wanted in zip(solution.sized.grams, own, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    wide = replace(solution, sized=solution.equations)
+    assert (np.diag(solution.covariance) < 0.9 * np.diag(wide.covariance)).any()
+
+
 def test_squares_are_those_of_the_runs_without_their_own_say(solution: Solution) -> None:
     """Before: the residual as it is; after: about the noise, of which the coefficients of the others know nothing."""
     found = predict(solution)
