@@ -95,12 +95,16 @@ cdef double louder_nm2(const InputLaw *law, const InputState *s) noexcept nogil
 cdef bint in_order(const InputState *s) noexcept nogil
 cdef void bound_inputs(InputState *s, double most) noexcept nogil
 
-cdef struct Samples:  # hashes of the last 256 samples, and where the last one with a hash stands, by its low byte
+cdef struct Run:  # of samples that equal those of a lag before
+    double evidence
+    unsigned int first, last, alone  # numbers of samples; how many stood once in their period
+
+cdef struct Samples:  # hashes of the last 256 samples; where the last one of a low byte stands, and the one before it
     uint64_t words[256]
-    uint8_t at[256]
-    uint8_t next, lag  # lag: of the run that is followed, 0 for none
-    int run, length, unlike, since  # samples of it that differ from the one before; all of it; that continued none; since a jump
-    double usual, weight  # mean length of runs; log(1 + 1/usual)
+    uint8_t at[256], older[256]
+    Run runs[256]  # by lag
+    uint8_t next, whole  # whole: lag of a run that was a whole period at the last sample, 0 for none
+    unsigned int count, since, still  # samples; since a jump; since a position changed
 
 cdef class Plausibility:
     cdef Samples samples

@@ -15,12 +15,14 @@
 | CURRENT_FROZEN | the same current, not 0, for frozen_s while the motor turned by FROZEN_RAD | current or its PDO frozen |
 | REPEATED | samples, all four numbers, equal those of a fixed number of samples ago for longer than chance | they have come before: all later ones are as old |
 
-Noise does not come twice. A run of samples equal to those of `lag` samples ago (2 to 255) is as long as chance makes it: geometric,
-of the mean length of KNOWN_RUNS. No proof is a sample equal to the last one, or no noise from the start on, or a run beyond its lag.
+Noise does not come twice. What has the probability q came 1/q samples ago, in the mean (Kac 1947), whatever q is: of a run of samples
+that equal those of `lag` samples ago, n samples after the nearest equal one each, chance has the probability 1/product(n) at most:
 
-    run log(1 + 1/usual) > RARE                      run log(KNOWN_RUNS) > RARE - JUMPED of one that a jump of the motor begins
+    sum(log n) > RARE + log(lag)              within its lag, where a position has changed: the current alone may have a limit cycle
+    sum(log n) + alone > RARE + log(lag)      where it ends after its lag: no limit cycle; alone: samples with n = lag
 
-A jump: abs(slip) > JUMPS times the largest of the last SLIP_S; 2.4 times in 280 000 healthy samples. No moving joint repeats a sample.
+No evidence is a sample that goes on with a shorter period. Enough is a run of AFTER_A_JUMP, alone, that begins with a jump of the
+motor: abs(slip) > JUMPS times the largest of SLIP_S, 2.4 times in 280 000 samples. At rest chance exceeds RARE once in three years.
 Nothing is concluded from a value that stands still beside others that stand still: a joint at rest is no fault. The limit of
 the twist is what twice the largest believable torque does to the gear, and `twist_rad` for encoder errors: the
 reference is the first sample, whose own torque is not known. It stays, over gaps too, until `reset()`.
@@ -96,11 +98,11 @@ cdef double LONGEST_STEP_S = 0.05  # differences over a longer step are not judg
 cdef double GAP_PERIODS = 5.0  # a longer step is a gap: its slip is acceleration that was not measured, and is not added up
 cdef int MOTOR_JUMP = st.MOTOR_JUMP, LINK_JUMP = st.LINK_JUMP, VELOCITY_MISMATCH = st.VELOCITY_MISMATCH
 cdef int TORSION = st.TORSION, CURRENT_FROZEN = st.CURRENT_FROZEN, REPEATED = st.REPEATED
-cdef double RARE = 28.0  # logarithm of how rarely chance repeats so many samples: less than once in years
-cdef int KNOWN_RUNS = 64  # of equal samples, or samples unlike all before: their mean is known, and is a mean of so many
-cdef double JUMPED = 17.0, JUMPS = 4.0, SLIP_S = 0.05, LEAST_SLIP = 1e-3  # logarithm; ratio; [s]; [rad], of a channel without noise
-cdef double PER_UNLIKE = log(KNOWN_RUNS), LEAST_RUN = 0.25  # of the usual length: what moved without a repetition may come to rest with few values
+cdef double RARE = 24.0, JUMPS = 4.0, SLIP_S = 0.05, LEAST_SLIP = 1e-3  # evidence; ratio; [s]; [rad], of a channel without noise
+cdef unsigned int AFTER_A_JUMP = 3  # samples
 cdef uint64_t ODD = 0x9E3779B97F4A7C15
+cdef double LOG[256]
+LOG[:] = [0.0, *np.log(np.arange(1, 256))]
 
 cdef inline uint64_t _mixed(uint64_t word, double value) noexcept nogil:
     """Return a hash of all values so far."""
@@ -110,32 +112,29 @@ cdef inline uint64_t _mixed(uint64_t word, double value) noexcept nogil:
     return word ^ word >> 29
 
 
-cdef bint _repeats(Samples *s, uint64_t word, bint jumped) noexcept nogil:
-    """Take the hash of a sample; return whether the last ones are the same as earlier ones, by more than chance."""
-    cdef uint8_t k = s.next, slot = word & 0xFF, last = k - 1, seen, at, earlier
-    cdef bint differs = word != s.words[last], repeats
-    s.next += 1
-    s.since = 0 if jumped else s.since + 1
-    s.words[k] = word
-    if s.lag and word == s.words[<uint8_t> (k - s.lag)]:
-        s.run, s.length = s.run + differs, s.length + 1
-    else:
-        if s.lag:
-            s.usual += (s.run - s.usual) / KNOWN_RUNS
-            s.weight = log1p(1.0 / max(s.usual, LEAST_RUN))
-        s.unlike += differs and s.unlike < KNOWN_RUNS
-        seen = s.at[slot]
-        s.run, s.length, s.lag = 0, 1, <uint8_t> (k - seen)
-        if not differs or seen == k or word != s.words[seen]:
-            s.lag = 0
-        else:  # another lag had been taken meanwhile: what equals before counts as well
-            at, earlier = last, <uint8_t> (seen - 1)
-            while earlier != k and s.words[at] == s.words[earlier]:
-                s.run += s.words[at] != s.words[<uint8_t> (at - 1)]
-                at, earlier, s.length = at - 1, earlier - 1, s.length + 1
-    s.at[slot] = k
-    repeats = s.run * s.weight > RARE or (s.since == s.length - 1 and s.run * PER_UNLIKE > RARE - JUMPED)
-    return repeats and s.length <= s.lag and s.unlike == KNOWN_RUNS
+cdef bint _repeats(Samples *s, uint64_t word, bint jumped, bint still) noexcept nogil:
+    """Take a sample's hash, and of its step; return whether the last ones are the same as earlier ones, by more than chance."""
+    cdef uint8_t k = s.next, slot = word & 0xFF, at = s.at[slot], lag = k - at, before = 0, nearest = 0, ended = s.whole
+    cdef bint repeats = False, periodic = False
+    cdef unsigned int length = 0
+    cdef Run *run
+    s.next, s.count, s.whole = k + 1, s.count + 1, 0
+    s.since, s.still = 0 if jumped else s.since + 1, s.still + 1 if still else 0
+    while lag > before and s.words[at] & 0xFF == slot and length < 256:
+        if s.words[at] == word:
+            run = &s.runs[lag]
+            if run.last != s.count - 1:
+                run.first, run.evidence, run.alone = s.count, -LOG[lag], 0
+            run.last, length = s.count, s.count - run.first + 1
+            nearest, periodic = nearest or lag, periodic or length > lag
+            if not periodic:
+                run.evidence, run.alone = run.evidence + LOG[nearest], run.alone + (nearest == lag)
+                repeats |= (run.evidence > RARE and s.still < length) or (run.alone >= AFTER_A_JUMP and s.since == length - 1)
+            if lag <= length < 2 * lag and run.evidence + run.alone > RARE:
+                s.whole = lag
+        before, lag, at = lag, k - s.older[at], s.older[at]
+    s.words[k], s.older[k], s.at[slot] = word, s.at[slot], k
+    return repeats or (ended and s.runs[ended].last != s.count)
 
 
 cdef class Plausibility:
@@ -163,7 +162,6 @@ cdef class Plausibility:
         self.mismatch_rad = 0.0
         self.slip = LEAST_SLIP
         memset(&self.samples, 0, sizeof(Samples))
-        self.samples.usual, self.samples.weight = 1.0, log1p(1.0)
 
     def step(
         self, double dt_s, double motor_position_rad, double motor_velocity_rad_s, double link_position_rad,
@@ -180,7 +178,8 @@ cdef class Plausibility:
         cdef double twist = motor_position * self.per_turn - link_position
         cdef double change = twist - self.twist
         cdef uint64_t word = _mixed(_mixed(_mixed(_mixed(ODD, motor_position), link_position), motor_velocity), current)
-        cdef bint repeats = _repeats(&self.samples, word, fabs(slip) > JUMPS * self.slip)
+        cdef bint still = change == 0.0 and motor_position == self.motor, jumped = fabs(slip) > JUMPS * self.slip
+        cdef bint repeats = _repeats(&self.samples, word, jumped, still)
         self.slip = max(fabs(slip), self.slip - (self.slip - LEAST_SLIP) * min(dt_s / SLIP_S, 1.0))
         self.mismatch_rad = self.mismatch_rad * (1.0 - dt_s * FORGET_RATE) + slip
         self.motor = motor_position
@@ -256,6 +255,7 @@ cdef double CALM = 0.1  # samples out of order, of the last STRANGE_S
 cdef double FOLLOW_RATE = 50.0  # at which the torque follows the current
 # logarithms of how rarely healthy noise gives so long a run of equal samples, of a joint's inputs and of its link encoder alone
 cdef double RARE_EQUAL = 10.0, RARE_STILL = 14.0
+cdef int KNOWN_RUNS = 64  # of equal samples at rest: their mean is known, and is a mean of so many
 
 
 cdef int fill_inputs(InputLaw *law, joint, torsion, double noise) except -1:

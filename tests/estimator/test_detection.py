@@ -164,6 +164,30 @@ def test_noise_that_comes_twice_is_found_and_its_chance_is_not(counts: float) ->
         assert REPEATED in found[999 : 999 + 60]
 
 
+@pytest.mark.parametrize("counts", [0.6, 1.5])
+@pytest.mark.parametrize("delay", [10, 12, 19])
+def test_at_rest_data_that_turn_a_few_cycles_old_are_found(delay: int, counts: float) -> None:
+    """A sample later than they have come once more; noise of 0.6 counts repeats every thirtieth sample."""
+    rows, found = _noisy(20_000, counts, 7), []
+    for start in range(0, 20_000, 400):
+        check, turned = checks(), start + 370
+        for row in rows[start:turned]:
+            assert check.step(PERIOD_S, *row) == 0
+        late = [check.step(PERIOD_S, *row) for row in rows[turned - delay : turned + 1]]
+        found.append(REPEATED in late)
+    assert np.mean(found) >= 0.9
+
+
+@pytest.mark.parametrize("values", [2, 3, 5, 8, 30])
+def test_a_joint_that_stops_where_it_has_few_values_is_not_old(values: int) -> None:
+    """10 000 stops, each with values that have never come before: their first repetitions prove nothing."""
+    check, draw = checks(), np.random.default_rng(values)
+    for stop in range(10_000):
+        for which in draw.integers(0, values, 120).tolist():
+            angle = 1e-3 * stop + 1e-5 * which
+            assert check.step(PERIOD_S, angle, 0.0, 1e-2 * angle, 0.0) == 0
+
+
 @pytest.mark.parametrize("delay", [4, 5, 12])
 def test_of_a_moving_joint_few_samples_that_come_twice_are_found(delay: int) -> None:
     """Noise of two counts on 1.5 rad/s of the motor: it jumps back, and sends again what it sent before."""
@@ -193,13 +217,14 @@ def test_a_repetition_is_told_by_its_samples_and_not_by_those_that_stand_still()
     assert {check.step(PERIOD_S, *rows[n // 7 % 2]) for n in range(20_000)} == {0}
 
 
-@pytest.mark.parametrize("period", [4, 12, 16])
+@pytest.mark.parametrize("period", [4, 12, 16, 40])
 def test_a_limit_cycle_at_rest_repeats_and_is_not_old(period: int) -> None:
     """A noisy joint stops, and its current goes up and down in the counts of its converter, the same every time."""
     check = checks()
     assert {check.step(PERIOD_S, *row) for row in _noisy(20_000, 1.5, 2)} == {0}
     cycle = [8e-3 * abs(n - period // 2) for n in range(period)]
     assert {check.step(PERIOD_S, 0.0, 0.0, 0.0, cycle[n % period]) for n in range(5000)} == {0}
+    assert {check.step(PERIOD_S, *row) for row in _noisy(1000, 1.5, 9)} == {0}
 
 
 def test_no_current_at_all_while_the_motor_is_turned_is_no_fault() -> None:
