@@ -43,6 +43,7 @@ STUDIES: Final = {
         "validation.measured",
         "the measured arm: joint files as shipped and fitted, offline or on a bus",
     ),
+    "external_torque": ("validation.arm.study", "external torque of a foreign arm: pushes, clamps, payloads"),
     "reproduce": ("validation.reproduce", "all campaigns, fits, training and evaluation"),
     "trials": ("validation.diagnosis.trials", "diagnosis: effects hidden by the project's generator"),
     "benches": ("validation.diagnosis.benches", "diagnosis: effects hidden in MuJoCo and in measured runs"),

@@ -1,0 +1,168 @@
+"""External torque of a foreign arm: an estimator and the momentum observer on motor current, judged on held-out days.
+
+Arms are drawn, identified from free motion with two payloads, and judged on days with pushes and clamps and on quiet days.
+The judged method decides the exit status. `oracle` has the true model and is told payload and contact: what joints as wrong
+as these allow. `zero` says that nothing ever pushes.
+
+python -m validation external_torque --quick             few days: shares are wide
+python -m validation external_torque --jobs 2            30 days and 3 quiet hours of two plants, about an hour of processor
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from jtqd.estimator.command_line import count, natural
+from validation.arm.arm import CYCLE_S, Readings, Run, Truth, read
+from validation.arm.baseline import Baseline
+from validation.arm.judge import (
+    Figures,
+    Found,
+    Published,
+    Row,
+    curve_rows,
+    figures,
+    judge,
+    oracle,
+    rows,
+    zero,
+)
+from validation.arm.trial import ERRORS, LEARN_S, QUIET_S, Trial, batches, error_process
+from validation.study import Report, Table, in_processes
+
+SEED: Final = 38021
+"""Of the judging days; 38001 to 38020 are for practice."""
+BASELINE: Final = "baseline"
+METHODS: Final = ("oracle", "zero")
+AT_ONCE: Final = 10
+"""Runs side by side."""
+Method = Callable[[Run, Truth, Readings], Published]
+
+
+class Work(NamedTuple):
+    """One arm of one plant: its days with contact, its quiet ones, the methods."""
+
+    plant: str
+    seed: int
+    arm: int
+    days: Sequence[int]
+    quiet: Sequence[int]
+    methods: Sequence[str]
+
+
+class Done(NamedTuple):
+    """What the runs tell by method, and the processor time of a cycle."""
+
+    plant: str
+    found: dict[str, list[Found]]
+    cost_us: dict[str, float]
+
+
+def judged(work: Work) -> Done:
+    """Identify and run one arm."""
+    trial = Trial(work.plant, work.seed, work.arm)
+    arm, joints = trial.arm, partial(error_process, plant=work.plant)
+    told = []
+    for part in batches(trial.identification(), AT_ONCE):
+        for each, truth in zip(part, arm.record([one.run for one in part]), strict=True):
+            told.append((read(arm, each.run, truth, joints), each.payload))
+    baseline = Baseline(arm, told)
+    made: dict[str, Method] = {
+        "oracle": lambda run, truth, readings: oracle(arm, run, truth, readings),
+        "zero": lambda run, truth, readings: zero(arm, readings, work.plant),
+        BASELINE: lambda run, truth, readings: baseline.run(readings),
+    }
+    found: dict[str, list[Found]] = {name: [] for name in work.methods}
+    spent, cycles = dict.fromkeys(work.methods, 0.0), 0
+    for days, drawn in ((work.days, trial.contact), (work.quiet, trial.quiet)):
+        for part in batches(days, AT_ONCE):
+            runs = [drawn(day) for day in part]
+            for run, truth in zip(runs, arm.record(runs), strict=True):
+                readings = read(arm, run, truth, joints)
+                cycles += len(readings.time_s)
+                for name in work.methods:
+                    begin = time.process_time()
+                    published = made[name](run, truth, readings)
+                    spent[name] += time.process_time() - begin
+                    found[name].append(judge(arm, run, truth, readings, published))
+    return Done(work.plant, found, {name: 1e6 * spent[name] / max(cycles, 1) for name in work.methods})
+
+
+def works(options: argparse.Namespace) -> list[Work]:
+    """Return the arms of all plants with their days."""
+    days, hours = (3, 0.06) if options.quick else (options.days, options.quiet_hours)
+    arms = 1 if options.quick else options.arms
+    quiet = math.ceil(3600.0 * hours / (QUIET_S - LEARN_S))
+    names = list(dict.fromkeys((options.method, BASELINE, *METHODS)))
+    return [
+        Work(plant, options.seed, arm, range(arm, days, arms), range(arm, quiet, arms), names)
+        for plant in options.plant or tuple(ERRORS)
+        for arm in range(arms)
+    ]
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--plant", action="append", choices=tuple(ERRORS), help="laws of the joints (default both)"
+    )
+    parser.add_argument(
+        "--method", choices=(*METHODS, BASELINE), default="oracle", help="judged (default %(default)s)"
+    )
+    parser.add_argument("--seed", type=natural, default=SEED, help="of arms and days (default %(default)s)")
+    parser.add_argument("--arms", type=count, default=3, help="per plant (default %(default)s)")
+    parser.add_argument("--days", type=count, default=30, help="with contacts (default %(default)s)")
+    parser.add_argument("--quiet-hours", type=float, default=3.0, help="without (default %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="one arm, three days, four quiet minutes")
+    parser.add_argument("--jobs", type=count, default=1, metavar="N", help="arms at a time (default 1)")
+
+
+def run(options: argparse.Namespace) -> Report:
+    work = works(options)
+    done = list(in_processes(judged, work, options.jobs, "arms"))
+    tables, values, reached = [], {}, True
+    for plant in dict.fromkeys(each.plant for each in work):
+        own = [each for each in done if each.plant == plant]
+        names = list(own[0].found)
+        made = [figures([f for each in own for f in each.found[name]], plant) for name in names]
+        cost = float(np.mean([each.cost_us[names[0]] for each in own]))
+        found = rows(plant, made, np.nan if names[0] in METHODS else cost)
+        reached = reached and all(row.reached is not False for row in found)
+        tables += [
+            _table(found, names, f"{plant}: {_sizes(own[0].found[names[0]], len(own))}"),
+            _curve(made, names),
+        ]
+        values[plant] = dict(zip(names, (each._asdict() for each in made), strict=True))
+    return Report(tables, {"trial": options.seed}, NOTES, values, reached)
+
+
+NOTES: Final = (
+    f"Days count after {LEARN_S:g} s of free motion, in which the payload may be learned; cycle {CYCLE_S:g} s.",
+    "Link right: of contacts that the link's own joint can feel; the point where three joints are before it.",
+)
+
+
+def _sizes(found: Sequence[Found], arms: int) -> str:
+    return f"{arms} arms, {len(found)} days, {sum(len(each.events) for each in found)} contacts"
+
+
+def _table(found: Sequence[Row], names: Sequence[str], title: str) -> Table:
+    marks = {True: "yes", False: "NO", None: ""}
+    filled = [[*row.cells, *[""] * (len(names) - len(row.cells))] for row in found]
+    return Table(
+        ("figure", "to reach", *names, "reached"),
+        [(row.what, row.limit, *cells, marks[row.reached]) for row, cells in zip(found, filled, strict=True)],
+        title,
+    )
+
+
+def _curve(made: Sequence[Figures], names: Sequence[str]) -> Table:
+    return Table(
+        ("pushes reported in time, by force", *names), [(row.what, *row.cells) for row in curve_rows(made)]
+    )
