@@ -165,7 +165,7 @@ def test_noise_that_comes_twice_is_found_and_its_chance_is_not(counts: float) ->
 
 
 @pytest.mark.parametrize("counts", [0.6, 1.5])
-@pytest.mark.parametrize("delay", [10, 12, 19])
+@pytest.mark.parametrize("delay", [9, 12, 19])
 def test_at_rest_data_that_turn_a_few_cycles_old_are_found(delay: int, counts: float) -> None:
     """A sample later than they have come once more; noise of 0.6 counts repeats every thirtieth sample."""
     rows, found = _noisy(20_000, counts, 7), []
