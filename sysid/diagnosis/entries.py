@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Final
 
@@ -188,6 +189,20 @@ def entry_of(
             low, high = max(low, around[0]), min(high, around[1])
     odds = math.log(chance / (1.0 - chance))
     return Entry(c, kind, prior, weights, odds, (kind, c.joint, detail), low, high)
+
+
+def slices_of(entries: Iterable[Entry]) -> list[slice]:
+    """Return where the coefficients of each entry are among those of all."""
+    ends = np.cumsum([0, *(e.size for e in entries)]).tolist()
+    return [slice(a, b) for a, b in pairwise(ends)]
+
+
+def transform_of(entries: Sequence[Entry], columns: int) -> FloatArray:
+    """Return the weights of scaled coefficients of entries in the library's columns [P, E]."""
+    out = np.zeros((columns, sum(e.size for e in entries)))
+    for e, at in zip(entries, slices_of(entries), strict=True):
+        out[list(e.columns), at] = e.weights
+    return out
 
 
 def _sizes(c: EffectCandidate) -> int:

@@ -25,7 +25,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -33,7 +32,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis import limits
-from jtqd.sysid.diagnosis.entries import Entry
+from jtqd.sysid.diagnosis.entries import Entry, slices_of
 from jtqd.sysid.diagnosis.regressors import Index
 
 Set = frozenset[int]
@@ -66,12 +65,6 @@ def columns_of(entries: Sequence[Entry], chosen: Set) -> Index:
     """Return the places of a set's coefficients among those of all entries."""
     spans = slices_of(entries)
     return np.array([j for k in sorted(chosen) for j in range(spans[k].start, spans[k].stop)], np.intp)
-
-
-def slices_of(entries: Iterable[Entry]) -> list[slice]:
-    """Return where the coefficients of each entry are among those of all."""
-    ends = np.cumsum([0, *(e.size for e in entries)]).tolist()
-    return [slice(a, b) for a, b in pairwise(ends)]
 
 
 def _bounds(entries: Iterable[Entry]) -> tuple[FloatArray, FloatArray]:

@@ -21,8 +21,16 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import Linear
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.dataset import Dataset, binned_runs, unpowered_columns, with_readings
-from jtqd.sysid.diagnosis.entries import Entry, entries_of, present_effects, set_state, shapes_of
-from jtqd.sysid.diagnosis.evidence import Equations, Means, Set, Sets, columns_of, slices_of
+from jtqd.sysid.diagnosis.entries import (
+    Entry,
+    entries_of,
+    present_effects,
+    set_state,
+    shapes_of,
+    slices_of,
+    transform_of,
+)
+from jtqd.sysid.diagnosis.evidence import Equations, Means, Set, Sets, columns_of
 from jtqd.sysid.diagnosis.findings import Present, shows_at
 from jtqd.sysid.diagnosis.regressors import (
     ChannelData,
@@ -120,14 +128,6 @@ class Solution:
         wide = copy(self.sized)
         wide.recorded = np.maximum(wide.recorded, np.repeat(off, [e.size for e in self.entries]))
         return wide.sets(self.variances, self.chosen).fit(self.chosen).covariance
-
-
-def transform_of(entries: Sequence[Entry], columns: int) -> FloatArray:
-    """Return the weights of scaled coefficients of entries in the library's columns [P, E]."""
-    out = np.zeros((columns, sum(e.size for e in entries)))
-    for e, at in zip(entries, slices_of(entries), strict=True):
-        out[list(e.columns), at] = e.weights
-    return out
 
 
 def recorded(entries: Sequence[Entry], step_s: float) -> FloatArray:
