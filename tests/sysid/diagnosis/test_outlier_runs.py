@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.diagnosis import outlier_runs
 from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose, without_outlier_runs
 from jtqd.sysid.diagnosis.findings import Findings, OutlierRun, to_mapping
-from jtqd.sysid.diagnosis.outlier_runs import (
-    Comparison,
-    Deviation,
-    apart_from_others,
-    echo,
-    own_deviations,
-)
+from jtqd.sysid.diagnosis.outlier_runs import FAR, Comparison, Deviation, comparison, echo
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 
 NOMINAL = load_joint(shipped("joint1.yaml"))
@@ -134,18 +131,43 @@ def test_two_runs_cannot_tell_which_is_odd() -> None:
     assert odd_runs(changed(runs(count=2), [1], current_gain)) == []
 
 
+def compared_rows(rows: Sequence[FloatArray], usual: float = 0.02, echo: float = 0.0) -> Comparison:
+    """Rows [n, 3] of each run: of what all share, of a deviation, residual in units of noise; echo: of run 2."""
+    echoes = np.zeros(len(rows))
+    echoes[2] = echo
+    count = np.full(len(rows), float(len(rows[0])))
+    return comparison(np.array([x.T @ x for x in rows]), count, np.array([usual]), echoes)
+
+
 def test_size_of_a_deviation_beside_the_others() -> None:
-    own = np.array([0.01, -0.01, 0.5, 0.0])
-    apart, spread = apart_from_others(own, 2, 0.02)
-    assert apart == pytest.approx(0.5)
-    assert spread == pytest.approx(np.sqrt((2e-4 + 4.0 * 4e-4) / 7.0)), "what is usual counts as four runs"
     rng = np.random.default_rng(1)
-    blocks = [np.column_stack([rng.normal(size=(300, 2)), np.zeros(300)]) for _ in range(4)]
-    for k, block in enumerate(blocks):  # column 0 is common to all, column 1 the run's own
-        block[:, 2] = 0.7 * block[:, 0] + (0.5 if k == 2 else 0.0) * block[:, 1] + rng.normal(size=300)
-    values, errors = own_deviations(np.array([b.T @ b for b in blocks]), [0], 1)
-    assert values == pytest.approx([0.0, 0.0, 0.5, 0.0], abs=0.2)
-    assert errors == pytest.approx(np.full(4, np.sqrt(1.0 + 1.0 / 3.0) / np.sqrt(300.0)), rel=0.1)
+    rows = [np.column_stack([rng.normal(size=(9000, 2)), np.zeros(9000)]) for _ in range(4)]
+    for k, row in enumerate(rows):
+        row[:, 2] = 0.7 * row[:, 0] + (0.5 if k == 2 else 0.0) * row[:, 1] + rng.normal(size=9000)
+    seen = compared_rows(rows)
+    assert seen.apart == pytest.approx([-1.0 / 6.0, -1.0 / 6.0, 0.5, -1.0 / 6.0], abs=0.04)
+    error = np.sqrt((1.0 + 1.0 / 3.0) / 9000.0 + 0.02**2 / 3.0)
+    assert seen.error == pytest.approx(np.full(4, error), rel=0.1), "and of the mean of the others"
+    spread = 0.02 * np.sqrt(4.0 / 7.0)
+    assert seen.spread[2] == pytest.approx(spread, rel=0.1), (
+        "the others agree; what is usual counts as four runs"
+    )
+    assert seen.distance[2] == pytest.approx(0.5 / np.hypot(spread, error), rel=0.1)
+    assert seen.distance[[0, 1, 3]].max() < 3.0
+
+
+def test_runs_that_differ_among_themselves_make_none_odd() -> None:
+    """A deviation of 0.3 is far where the others agree, and near where they differ by as much."""
+    rng = np.random.default_rng(2)
+    far = {}
+    for spread in (0.0, 0.2):
+        rows = [np.column_stack([rng.normal(size=(20000, 2)), np.zeros(20000)]) for _ in range(8)]
+        for k, row in enumerate(rows):
+            own = 0.3 if k == 2 else spread * (-1.0) ** k
+            row[:, 2] = 0.7 * row[:, 0] + own * row[:, 1] + rng.normal(size=20000)
+        far[spread] = compared_rows(rows).distance[2]
+    assert far[0.2] < 3.0
+    assert far[0.0] > 10.0
 
 
 @pytest.mark.parametrize(("own", "strange", "odd"), [(3.0, 1.0, True), (0.5, 5.0, False)])
@@ -155,13 +177,17 @@ def test_a_run_is_odd_by_what_sets_it_apart(own: float, strange: float, odd: boo
     rows = [rng.normal(size=(2000, 3)) for _ in range(5)]  # an effect of all, a deviation, the residual
     for k, row in enumerate(rows):
         row[:, 2] = 0.7 * row[:, 0] + (own * row[:, 1] + strange * row[:, 2] if k == 2 else row[:, 2])
-    comparison = Comparison(np.array([row.T @ row for row in rows]), np.full(5, 2000.0), 1, np.zeros((5, 1)))
-    assert comparison.drop([0], [(2, 0)], 2, 0) > 300.0, "certain in both cases"
-    assert comparison.explains_excess([0], [(2, 0)], (2, 0)) == odd
+    seen = compared_rows(rows)
+    assert seen.distance[2] > 10.0, "certain in both cases"
+    assert seen.explains[2] == odd
 
 
 def test_a_run_that_is_set_apart_by_something_else_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Comparison, "explains_excess", lambda *_: False)
+    def explains_nothing(*given: Any) -> Comparison:
+        seen = comparison(*given)
+        return seen._replace(explains=np.zeros_like(seen.explains))
+
+    monkeypatch.setattr(outlier_runs, "comparison", explains_nothing)
     assert odd_runs(changed(runs(), [2], current_gain)) == []
 
 
@@ -192,11 +218,7 @@ def test_a_channel_that_is_all_noise_makes_no_run_odd() -> None:
     rng = np.random.default_rng(4)
     rows = [rng.normal(size=(2000, 3)) for _ in range(5)]
     rows[2][:, 2] += rows[2][:, 1]
-    grams = np.array([row.T @ row for row in rows])
-    for own, far in ((0.0, True), (1.0, False)):
-        echoes = np.zeros((5, 1))
-        echoes[2] = own
-        assert (Comparison(grams, np.full(5, 2000.0), 1, echoes).far([0], (2, 0), [gain]) is not None) == far
+    assert compared_rows(rows).distance[2] > FAR > compared_rows(rows, echo=1.0).distance[2]
 
 
 def test_text_says_what_run_and_channel() -> None:
