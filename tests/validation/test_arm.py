@@ -12,7 +12,19 @@ import pytest
 
 from tests.paths import ROOT
 from validation.arm import arm as plant
-from validation.arm.arm import CYCLE_S, JOINTS, Arm, Contact, Payload, Run, Trains, Truth, read, rigid
+from validation.arm.arm import (
+    CYCLE_S,
+    JOINTS,
+    Arm,
+    Contact,
+    Payload,
+    Run,
+    Silence,
+    Trains,
+    Truth,
+    read,
+    rigid,
+)
 from validation.arm.baseline import Baseline, Dynamics
 from validation.arm.judge import tool_jacobians
 from validation.arm.trial import (
@@ -295,6 +307,13 @@ def test_instruments_read_with_counts_and_the_errors_of_the_day() -> None:
     readings = read(arm, run, truth, lambda *_: (truth.drive_nm, truth.drive_nm, truth.drive_nm))
     day = arm.day(0)
     unit = 2.0 * np.pi / 524288
+    silent = read(
+        arm, run._replace(silences=(Silence(2, 0.5, 0.7),)), truth, lambda *_: (truth.drive_nm,) * 3
+    )
+    lost = np.isnan(silent.torque_nm)
+    assert np.array_equal(np.flatnonzero(lost.any(axis=1)), np.arange(500, 700))
+    assert np.array_equal(np.flatnonzero(lost.any(axis=0)), [2])
+    assert (silent.status[500:700, 2] == plant.NO_TORQUE).all()
     assert readings.link_rad / unit == pytest.approx(np.round(readings.link_rad / unit), abs=1e-6)
     waves = 5.5e-5
     assert np.abs(readings.link_rad - truth.link_rad - day["link_zero_rad"]).max() < waves + 6.0 * 6e-6

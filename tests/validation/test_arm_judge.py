@@ -13,7 +13,7 @@ import pytest
 
 from validation import __main__ as command
 from validation.arm import study
-from validation.arm.arm import CYCLE_S, JOINTS, Arm, Contact, Payload, Readings, Run, Truth, rigid
+from validation.arm.arm import CYCLE_S, JOINTS, Arm, Contact, Payload, Readings, Run, Silence, Truth, rigid
 from validation.arm.judge import (
     BINS_N,
     RMS,
@@ -135,6 +135,16 @@ def test_errors_are_of_rated_and_without_contact() -> None:
     out.external_nm[at(12.5) : at(13.5), 3] = np.nan
     free = free_cycles(one.run, len(out.contact)).sum()
     assert figures([found(out)], "typical").published == pytest.approx(1.0 - 1000 / free)
+    out.external_nm[at(12.5) : at(13.5), 3] = 0.03 * one.arm.rated_nm[3]
+    for quiet, told in ((False, 2000), (True, 0)):
+        run = one.run._replace(silences=(Silence(3, 12.0, 14.0),))
+        out.external_nm[at(12.0) : at(14.0), 3] = np.nan if quiet else 1e6
+        made = figures([judge(one.arm, run, one.truth, one.readings, out)], "typical")
+        assert made.told == (told, 2000)
+        assert made.published == 1.0
+        assert made.rms == pytest.approx(np.full(JOINTS, 0.03))
+        row = "a joint without torque: cycles with its external torque"
+        assert by_name(rows("typical", [made, made]))[row].reached is quiet
     assert figures([found(nothing(len(out.contact)))], "typical").rms.min() == np.inf
 
 

@@ -76,13 +76,29 @@ class Contact(NamedTuple):
 FALL_S: Final = 0.05
 
 
+class Silence(NamedTuple):
+    """A joint (0..6) whose jtqd has no torque for a while."""
+
+    joint: int
+    start_s: float
+    end_s: float
+
+
 class Run(NamedTuple):
-    """What happens on a day: positions to follow [n, 7] at 1 kHz, who pushes, what hangs at the tool."""
+    """What happens on a day: positions to follow [n, 7] at 1 kHz, who pushes, what hangs at the tool, who is silent."""
 
     day: int
     reference_rad: Array
     payload: Payload = Payload()
     contacts: tuple[Contact, ...] = ()
+    silences: tuple[Silence, ...] = ()
+
+    def silent(self, n: int, after_s: float = 0.0) -> Array:
+        """Return which joints have no torque, or had none up to after_s ago [n, 7]."""
+        t, found = CYCLE_S * np.arange(n), np.zeros((n, JOINTS), bool)
+        for each in self.silences:
+            found[:, each.joint] |= (t >= each.start_s) & (t < each.end_s + after_s)
+        return found
 
 
 class Truth(NamedTuple):
@@ -525,6 +541,8 @@ def read(arm: Arm, run: Run, truth: Truth, joints: Joints) -> Readings:
     speed = np.diff(motor, axis=0, prepend=motor[:1]) / CYCLE_S
     for k in range(1, n):
         speed[k] = speed[k - 1] + share * (speed[k] - speed[k - 1])
+    torque, sigma, status = joints(arm, run, truth, rng)
+    silent = run.silent(n)
     return Readings(
         CYCLE_S * np.arange(n),
         _counted(amps, size * arm.law["drive"]["rated_current_a"] / 1000.0),
@@ -532,7 +550,9 @@ def read(arm: Arm, run: Run, truth: Truth, joints: Joints) -> Readings:
         speed,
         _counted(link, 2.0 * np.pi / p["link_counts_per_rev"]),
         _counted(truth.celsius, 0.1),
-        *joints(arm, run, truth, rng),
+        np.where(silent, np.nan, torque),
+        np.where(silent, np.nan, sigma),
+        np.where(silent, NO_TORQUE, status),
     )
 
 

@@ -103,13 +103,14 @@ class Event(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Of one run: sums over free cycles [7], mean square under full force [7], contacts, false alarms, payload, wrenches.
+    """Of one run: counts and sums over free cycles [7], mean square under full force [7], contacts, false alarms, payload,
+    wrenches; told, silent: cycles of joints without a torque that have an external torque all the same, and all of them.
 
     Errors of a payload: infinite where none is published, NaN where none is judged.
     """
 
-    cycles: int
-    published: int
+    cycles: Array
+    published: Array
     square: Array
     inside: Array
     pushed: Array
@@ -121,6 +122,8 @@ class Found(NamedTuple):
     wrench_square: float
     wrenches: int
     poses: int
+    told: int
+    silent: int
 
 
 def free_cycles(run: Run, n: int, after_s: float = SETTLED_S) -> Array:
@@ -137,8 +140,11 @@ def judge(arm: Arm, run: Run, truth: Truth, readings: Readings, published: Publi
     n = len(truth.link_rad)
     free = free_cycles(run, n)
     error = published.external_nm - truth.external_nm
-    there = free & np.isfinite(error).all(axis=1) & np.isfinite(published.sigma_nm).all(axis=1)
-    share = error[there] / arm.rated_nm
+    silent = run.silent(n)
+    due = free[:, None] & ~run.silent(n, SETTLED_S)
+    there = due & np.isfinite(error) & np.isfinite(published.sigma_nm)
+    square = np.where(there, error / arm.rated_nm, 0.0) ** 2
+    inside = there & (np.abs(error) <= GAUSS * published.sigma_nm)
     began = np.flatnonzero(np.diff((published.contact != 0).astype(np.int8), prepend=0) == 1)
     at = round(LEARN_S / CYCLE_S)
     off = np.array([np.nan, np.nan])
@@ -146,12 +152,12 @@ def judge(arm: Arm, run: Run, truth: Truth, readings: Readings, published: Publi
         off[0] = abs(published.payload_kg[at] / run.payload.mass_kg - 1.0)
         off[1] = np.linalg.norm(published.centre_m[at] - np.array(run.payload.centre_m))
         off[np.isnan(off)] = np.inf
-    wrench = _wrenches(run, truth, readings, published, free)
+    wrench = _wrenches(run, truth, readings, published, free & ~silent.any(axis=1))
     return Found(
-        int(free.sum()),
-        int(there.sum()),
-        np.asarray((share * share).sum(axis=0)),
-        np.asarray((np.abs(error[there]) <= GAUSS * published.sigma_nm[there]).sum(axis=0)),
+        due.sum(axis=0),
+        there.sum(axis=0),
+        square.sum(axis=0),
+        inside.sum(axis=0),
         _pushed(run, error / arm.rated_nm),
         [
             _event(arm, contact, truth, published, began)
@@ -163,6 +169,8 @@ def judge(arm: Arm, run: Run, truth: Truth, readings: Readings, published: Publi
         float(off[0]),
         float(off[1]),
         *wrench,
+        int((silent & np.isfinite(published.external_nm)).sum()),
+        int(silent.sum()),
     )
 
 
@@ -263,6 +271,7 @@ class Figures(NamedTuple):
     pushed: Array
     inside: Array
     published: float
+    told: tuple[int, int]
     mass: float
     centre_m: float
     detected: dict[str, tuple[int, int]]
@@ -280,7 +289,10 @@ class Figures(NamedTuple):
 
 def figures(found: Sequence[Found], plant: str) -> Figures:
     """Return the figures of runs, at least one."""
-    cycles, published = (sum(getattr(each, key) for each in found) for key in ("cycles", "published"))
+    cycles, published, square, inside = (
+        np.sum([getattr(each, key) for each in found], axis=0)
+        for key in ("cycles", "published", "square", "inside")
+    )
     events = [event for each in found for event in each.events]
     told = [e for e in events if e.told and e.own_share >= TELLS * RMS[plant]]
     points = [e.point_off_m for e in told if e.link >= POINT_FROM and e.told == e.link]
@@ -290,12 +302,11 @@ def figures(found: Sequence[Found], plant: str) -> Figures:
     pushed = [each.pushed for each in found if not np.isnan(each.pushed).any()]
     heavy = [each for each in found if not np.isnan(each.mass_off)]
     return Figures(
-        np.sqrt(sum(each.square for each in found) / max(published, 1))
-        if published
-        else np.full(JOINTS, np.inf),
+        np.sqrt(np.where(published > 0, square / np.maximum(published, 1), np.inf)),
         np.sqrt(np.mean(pushed, axis=0)) if pushed else np.full(JOINTS, np.nan),
-        sum((each.inside for each in found), np.zeros(JOINTS)) / max(published, 1),
-        published / max(cycles, 1),
+        inside / np.maximum(published, 1),
+        float((published / np.maximum(cycles, 1)).min()),
+        (sum(each.told for each in found), sum(each.silent for each in found)),
         _rms([each.mass_off for each in heavy]),
         _rms([each.centre_off_m for each in heavy]),
         {kind: _within(events, kind, limit) for kind, limit in WITHIN_S.items()},
@@ -363,10 +374,16 @@ def rows(plant: str, made: Sequence[Figures], cost_us: float = np.nan) -> list[R
             bool(low <= one.inside.min() and one.inside.max() <= high),
         ),
         Row(
-            "cycles with external torque",
+            "cycles with external torque, worst joint",
             f"{100 * PUBLISHED:.0f} %",
             [percent(f.published) for f in made],
             one.published >= PUBLISHED,
+        ),
+        Row(
+            "a joint without torque: cycles with its external torque",
+            "none",
+            [percent(f.told[0] / f.told[1]) if f.told[1] else "none" for f in made],
+            one.told[0] == 0,
         ),
         Row("payload, mass, rms", f"{100 * MASS:.0f} %", [percent(f.mass) for f in made], one.mass <= MASS),
         Row(

@@ -23,6 +23,7 @@ from validation.arm.arm import (
     Contact,
     Payload,
     Run,
+    Silence,
     Truth,
     limits,
     rigid,
@@ -33,6 +34,7 @@ LEARN_S: Final = 10.0
 IDENTIFY_RUNS, IDENTIFY_S = 8, 30.0
 CONTACT_S: Final = 80.0
 QUIET_S: Final = 120.0
+SILENCE_S: Final = 3.0
 KNOWN: Final = Payload(2.0, (0.01, -0.02, 0.06))
 """Second payload of the identification; the first one is nothing."""
 TOLD_KG, TOLD_M = 0.010, 0.001
@@ -257,9 +259,12 @@ class Trial:
         return Run(1000 + day, path, payload, drawer.contacts(path))
 
     def quiet(self, day: int, seconds: float = QUIET_S) -> Run:
-        """Return a day without contact."""
+        """Return a day without contact, on which the jtqd of one joint has no torque for a while."""
         drawer = Drawer(self._rng(3, day))
-        return Run(100000 + day, drawer.motion(seconds), _payload(drawer.rng))
+        path, payload = drawer.motion(seconds), _payload(drawer.rng)
+        start = drawer.rng.uniform(LEARN_S + 1.0, seconds - SILENCE_S - 2.0)
+        silence = Silence(int(drawer.rng.integers(JOINTS)), float(start), float(start) + SILENCE_S)
+        return Run(100000 + day, path, payload, silences=(silence,))
 
 
 def _payload(rng: np.random.Generator) -> Payload:
