@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 from functools import cache
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -22,6 +21,7 @@ from validation.arm.arm import (
     Silence,
     Trains,
     Truth,
+    no_joints,
     read,
     rigid,
 )
@@ -326,6 +326,18 @@ def test_instruments_read_with_counts_and_the_errors_of_the_day() -> None:
     assert np.abs(readings.motor_rad_s - np.gradient(truth.motor_rad, CYCLE_S, axis=0))[10:].std() < 3.0
 
 
+def test_on_a_towing_bench_every_joint_is_alone_with_its_load() -> None:
+    arm = Arm("typical", 7)
+    load = 0.4 * arm.rated_nm * np.sin(np.arange(800) / 150.0)[:, None]
+    truth = arm.tow([Run(1, swing(0.8))], load[None])[0]
+    assert truth.external_nm == pytest.approx(-load)
+    force = 0.5 * (truth.drive_nm[1:] + truth.drive_nm[:-1]) + truth.external_nm[:-1]
+    made = np.cumsum(force, axis=0) * CYCLE_S / (arm.size * 0.0175)
+    off = truth.link_rad_s[1:] - truth.link_rad_s[0] - made
+    assert (np.abs(off).max(axis=0) < 0.1 * np.ptp(truth.link_rad_s, axis=0)).all()
+    assert np.abs(truth.drive_nm - load).max() < 0.3 * arm.rated_nm.max()
+
+
 def test_a_run_is_the_same_alone_and_beside_others() -> None:
     arm = Arm("typical", 7)
     path = swing(0.3)
@@ -395,11 +407,8 @@ def test_the_baseline_finds_friction_payload_and_pushes() -> None:
     arm, run, truth = pushed()
     free = [Run(10 + k, swing(5.0, 0.35 + 0.05 * k), (Payload(), LOAD)[k % 2]) for k in range(4)]
 
-    def joints(*_: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return truth.drive_nm, truth.drive_nm, truth.drive_nm
-
     told = [
-        (read(arm, each, true, joints), each.payload)
+        (read(arm, each, true, no_joints), each.payload)
         for each, true in zip(free, arm.record(free), strict=True)
     ]
     baseline = Baseline(arm, told)
@@ -407,7 +416,7 @@ def test_the_baseline_finds_friction_payload_and_pushes() -> None:
     assert (baseline.sigma < 0.08 * arm.rated_nm).all()
     found = baseline._payload(told[1][0])
     assert found.mass_kg == pytest.approx(LOAD.mass_kg, abs=0.6)
-    residual = baseline._residual(read(arm, run, truth, joints), Dynamics(rigid(payload=LOAD)))
+    residual = baseline._residual(read(arm, run, truth, no_joints), Dynamics(rigid(payload=LOAD)))
     look = slice(round(1000 * run.contacts[1].full_s) + 100, round(1000 * run.contacts[1].end_s))
     off = residual[look] - truth.external_nm[look]
     assert (np.abs(off.mean(axis=0)) < 0.1 * arm.rated_nm).all()

@@ -117,7 +117,7 @@ class Truth(NamedTuple):
 class Readings(NamedTuple):
     """What the instruments of an arm give every cycle, [n, 7], and what a jtqd of each joint publishes of it.
 
-    torque_nm: drive-side torque, NaN where there is none; sigma_nm; status: NO_TORQUE, VALID.
+    torque_nm: drive-side torque, NaN where there is none; sigma_nm, half the width of an interval at STANDSTILL; status.
     """
 
     time_s: Array
@@ -131,7 +131,7 @@ class Readings(NamedTuple):
     status: Array
 
 
-NO_TORQUE, VALID = 0, 1
+NO_TORQUE, VALID, DEGRADED, STANDSTILL = range(4)
 
 
 def rigid(factors: Array | None = None, shifts_m: Array | None = None, payload: Payload | None = None) -> Any:
@@ -237,6 +237,9 @@ class Arm:
             section: {key: _column([side[section][key] for side in sides]) for key in sides[0][section]}
             for section in ("motor", "friction", "gear", "warmth", "measurement", "drive")
         }
+        self.link_kgm2 = np.full(
+            JOINTS, sum(file[side]["link_inertia_kgm2"] for side in ("joint_1", "joint_2"))
+        )
         self.days = {key: float(value) for key, value in file["run_to_run"].items()}
         turn = rng.uniform(0.0, 2.0 * np.pi, (6, JOINTS))
 
@@ -279,7 +282,11 @@ class Arm:
 
     def record(self, runs: Sequence[Run]) -> list[Truth]:
         """Return what happens in runs of one length."""
-        return _integrated(self, runs)
+        return _integrated(self, runs, _Bodies(self, runs))
+
+    def tow(self, runs: Sequence[Run], load_nm: Array) -> list[Truth]:
+        """Return the same with every joint alone on a towing bench against load_nm [B, n, 7]; no weight, no contacts."""
+        return _integrated(self, runs, _Benches(self, runs, load_nm))
 
 
 def _column(values: Sequence[Any]) -> Any:
@@ -438,53 +445,90 @@ class _Controllers:
         return np.asarray(self.current)
 
 
-def _integrated(arm: Arm, runs: Sequence[Run]) -> list[Truth]:
+class _Links:
+    """Links of runs side by side, [B, 7]: link, rate, external torque; weight at the start; wrench [B, 6]."""
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        self.link = np.stack([run.reference_rad[0] for run in runs])
+        self.rate, self.external, self.weight = (np.zeros_like(self.link) for _ in range(3))
+        self.wrench = np.zeros((len(runs), 6))
+
+    def feel(self, time_s: float) -> None:
+        """Set what pushes from outside now."""
+        raise NotImplementedError
+
+    def advance(self, tau: Array) -> None:
+        """Go on by a step with these torques of the gears."""
+        raise NotImplementedError
+
+
+class _Bodies(_Links):
+    """The arm's links in MuJoCo."""
+
+    def __init__(self, arm: Arm, runs: Sequence[Run]) -> None:
+        super().__init__(runs)
+        self.models = [arm.model(run.payload) for run in runs]
+        self.data = [mujoco.MjData(model) for model in self.models]
+        for b, (model, data) in enumerate(zip(self.models, self.data, strict=True)):
+            data.qpos[:] = self.link[b]
+            mujoco.mj_forward(model, data)
+            self.weight[b] = data.qfrc_bias
+        self.pushers = [_Pusher(*each) for each in zip(self.models, self.data, runs, strict=True)]
+        self.handles = [(d.qpos, d.qvel, d.qfrc_applied) for d in self.data]
+
+    def feel(self, time_s: float) -> None:
+        for b, pusher in enumerate(self.pushers):
+            if pusher.active(time_s):
+                self.external[b], self.wrench[b] = pusher.joints(time_s), pusher.wrench()
+            elif pusher.left:
+                self.external[b], self.wrench[b], pusher.left = 0.0, 0.0, False
+
+    def advance(self, tau: Array) -> None:
+        total, step = tau + self.external, mujoco.mj_step
+        for b, (q, w, f) in enumerate(self.handles):
+            f[:] = total[b]
+            step(self.models[b], self.data[b])
+            self.link[b], self.rate[b] = q, w
+
+
+class _Benches(_Links):
+    """Every joint alone on a towing bench, against load_nm [B, n, 7], with the inertia of the bench file's two links."""
+
+    def __init__(self, arm: Arm, runs: Sequence[Run], load_nm: Array) -> None:
+        super().__init__(runs)
+        self.load, self.mobility = load_nm, STEP_S / (arm.size * arm.link_kgm2)
+
+    def feel(self, time_s: float) -> None:
+        self.external = -self.load[:, int(time_s / CYCLE_S + 1e-6)]
+
+    def advance(self, tau: Array) -> None:
+        self.rate = self.rate + self.mobility * (tau + self.external)
+        self.link = self.link + STEP_S * self.rate
+
+
+def _integrated(arm: Arm, runs: Sequence[Run], links: _Links) -> list[Truth]:
     reference = np.stack([run.reference_rad for run in runs])
     count, n = reference.shape[:2]
-    models = [arm.model(run.payload) for run in runs]
-    bodies = [mujoco.MjData(model) for model in models]
-    link, rate, external = (np.zeros((count, JOINTS)) for _ in range(3))
-    link[:] = reference[:, 0]
-    weight = np.zeros_like(link)
-    for b, (model, data) in enumerate(zip(models, bodies, strict=True)):
-        data.qpos[:] = link[b]
-        mujoco.mj_forward(model, data)
-        weight[b] = data.qfrc_bias
     drawn = [arm.day(run.day) for run in runs]
     trains = Trains(arm, {key: np.stack([day[key] for day in drawn]) for key in drawn[0]})
-    trains.start(link, weight)
-    loops = _Controllers(arm, reference, weight)
-    kept = [np.empty((count, n, JOINTS)) for _ in range(7)]
-    wrench = np.zeros((count, n, 6))
-    pushers = [_Pusher(*each) for each in zip(models, bodies, runs, strict=True)]
-    handles = [(d.qpos, d.qvel, d.qfrc_applied) for d in bodies]
-    step, h = mujoco.mj_step, STEP_S
+    trains.start(links.link, links.weight)
+    loops = _Controllers(arm, reference, links.weight)
+    kept = Truth(*(np.empty((count, n, 6 if key == "wrench" else JOINTS)) for key in Truth._fields))
     for k in range(n):
         if k and k % UPDATE == 0:
             trains.warm(UPDATE * CYCLE_S)
         loops.plan(k, trains.motor)
         for s in range(SUBSTEPS):
-            tau = trains.torque(rate)
-            time_s = k * CYCLE_S + s * h
-            for b, pusher in enumerate(pushers):
-                if pusher.active(time_s):
-                    external[b] = pusher.joints(time_s)
-                    if s == 0:
-                        wrench[b, k] = pusher.wrench()
-                elif pusher.left:
-                    external[b], pusher.left = 0.0, False
+            tau = trains.torque(links.rate)
+            links.feel(k * CYCLE_S + s * STEP_S)
             if s == 0:
-                now = (link, rate, tau, external, trains.motor, loops.current, trains.housing)
-                for to, value in zip(kept, now, strict=True):
+                now = (links.link, links.rate, tau, links.external, links.wrench)
+                for to, value in zip(kept, (*now, trains.motor, loops.current, trains.housing), strict=True):
                     to[:, k] = value
-            trains.push(h, loops.step(h, trains.velocity), tau)
-            total = tau + external
-            for b, (q, w, f) in enumerate(handles):
-                f[:] = total[b]
-                step(models[b], bodies[b])
-                link[b], rate[b] = q, w
-            trains.turn(h, link)
-    return [Truth(*(each[b] for each in (*kept[:4], wrench, *kept[4:]))) for b in range(count)]
+            trains.push(STEP_S, loops.step(STEP_S, trains.velocity), tau)
+            links.advance(tau)
+            trains.turn(STEP_S, links.link)
+    return [Truth(*(each[b] for each in kept)) for b in range(count)]
 
 
 class _Pusher:
@@ -523,6 +567,12 @@ class _Pusher:
 
 Joints = Callable[[Arm, Run, Truth, np.random.Generator], tuple[Array, Array, Array]]
 """What a jtqd of each joint would publish of a run: torque, sigma, status, each [n, 7]."""
+
+
+def no_joints(arm: Arm, run: Run, truth: Truth, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Return the joints of an arm without any jtqd."""
+    nothing = np.full(truth.drive_nm.shape, np.nan)
+    return nothing, nothing, np.full(nothing.shape, NO_TORQUE, np.int8)
 
 
 def read(arm: Arm, run: Run, truth: Truth, joints: Joints) -> Readings:

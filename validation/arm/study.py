@@ -2,7 +2,8 @@
 
 Arms are drawn, identified from free motion with two payloads, and judged on days with pushes and clamps and on quiet days.
 The judged method decides the exit status. `oracle` has the true model and is told payload and contact: what joints as wrong
-as these allow. `zero` says that nothing ever pushes.
+as these allow. `zero` says that nothing ever pushes. With `--joints fitted` each joint is fitted on a towing bench and
+publishes what the product's estimator makes of its readings; else it is as wrong as `trial.ERRORS` says.
 
 python -m validation external_torque --quick             few days: shares are wide
 python -m validation external_torque --jobs 2            30 days and 3 quiet hours of two plants, about an hour of processor
@@ -20,7 +21,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.command_line import count, natural
-from validation.arm.arm import CYCLE_S, Readings, Run, Truth, read
+from validation.arm.arm import CYCLE_S, Joints, Readings, Run, Truth, read
 from validation.arm.baseline import Baseline
 from validation.arm.judge import (
     Figures,
@@ -40,6 +41,7 @@ from validation.study import Report, Table, in_processes
 SEED: Final = 38021
 """Of the judging days; 38001 to 38020 are for practice."""
 BASELINE: Final = "baseline"
+STATED, FITTED = "stated", "fitted"
 METHODS: Final = ("oracle", "zero")
 AT_ONCE: Final = 10
 """Runs side by side."""
@@ -55,6 +57,7 @@ class Work(NamedTuple):
     days: Sequence[int]
     quiet: Sequence[int]
     methods: Sequence[str]
+    fitted: bool = False
 
 
 class Done(NamedTuple):
@@ -68,7 +71,12 @@ class Done(NamedTuple):
 def judged(work: Work) -> Done:
     """Identify and run one arm."""
     trial = Trial(work.plant, work.seed, work.arm)
-    arm, joints = trial.arm, partial(error_process, plant=work.plant)
+    arm = trial.arm
+    joints: Joints = partial(error_process, plant=work.plant)
+    if work.fitted:
+        from validation.arm.joints import RealJoints, towed
+
+        joints = RealJoints(arm, *towed(arm))
     told = []
     for part in batches(trial.identification(), AT_ONCE):
         for each, truth in zip(part, arm.record([one.run for one in part]), strict=True):
@@ -102,7 +110,15 @@ def works(options: argparse.Namespace) -> list[Work]:
     quiet = math.ceil(3600.0 * hours / (QUIET_S - LEARN_S))
     names = list(dict.fromkeys((options.method, BASELINE, *METHODS)))
     return [
-        Work(plant, options.seed, arm, range(arm, days, arms), range(arm, quiet, arms), names)
+        Work(
+            plant,
+            options.seed,
+            arm,
+            range(arm, days, arms),
+            range(arm, quiet, arms),
+            names,
+            options.joints == FITTED,
+        )
         for plant in options.plant or tuple(ERRORS)
         for arm in range(arms)
     ]
@@ -114,6 +130,12 @@ def options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--method", choices=(*METHODS, BASELINE), default="oracle", help="judged (default %(default)s)"
+    )
+    parser.add_argument(
+        "--joints",
+        choices=(STATED, FITTED),
+        default=STATED,
+        help="what a jtqd per joint publishes: as wrong as stated (default), or fitted and estimated",
     )
     parser.add_argument("--seed", type=natural, default=SEED, help="of arms and days (default %(default)s)")
     parser.add_argument("--arms", type=count, default=3, help="per plant (default %(default)s)")
