@@ -22,13 +22,13 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.corrections import with_effects_applied
-from jtqd.estimator.effects.effect import MOTOR, SPAN_K, TORSION, Effect, Term
+from jtqd.estimator.effects.effect import MOTOR, SPAN_K, TORSION, ArrayFunctions, Effect, Term
 from jtqd.estimator.joint import Effect as EffectOfFile
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.findings import JointName, Present, shows_at
 from jtqd.sysid.diagnosis.limits import Prior, Usage
-from jtqd.sysid.diagnosis.regressors import EffectCandidate, contribution, fields_used
+from jtqd.sysid.diagnosis.regressors import EffectCandidate, contribution, fields_used, relative_to
 from jtqd.sysid.diagnosis.signals import JointSignals, held_by_spring
 from jtqd.sysid.diagnosis.smoothing import first_difference
 
@@ -286,17 +286,32 @@ def _set_torsion(s: JointSignals, mine: Sequence[Present]) -> None:
     if not bent:
         return
     usual = s.joint.rated_torque_nm / stiffness
-    # Newton: a spring that hardens by its own stiffness is no small change, and one that softens may hold no such torque
+    # Newton: a spring that hardens by its own stiffness is no small change, and one that softens may hold no such torque.
+    # What such a twist accelerates of the link is not in it: quicker than the link swings on its spring it would grow
     widest = max(usual, float(np.max(np.abs(total))) / stiffness) / _SOFTEST
     for _ in range(_MOST_STEPS):
         d = s.state.torsion_rad
-        here = _sum(s, bent, TORSION)
+        here = _twist(s, bent)
         s.state.torsion_rad = d + _TORSION_STEP * usual
-        slope = (_sum(s, bent, TORSION) - here) / (_TORSION_STEP * usual)
-        step = (total + here - stiffness * d) / np.maximum(stiffness - slope, _SOFTEST * stiffness)
+        slope = 1.0 + (_twist(s, bent) - here) / (_TORSION_STEP * usual)
+        step = (total / stiffness - here - d) / np.maximum(slope, _SOFTEST)
         s.state.torsion_rad = np.clip(d + step, -widest, widest)
         if float(np.max(np.abs(step))) < _TORSION_STEP * usual:
             return
+
+
+def _twist(s: JointSignals, present: Sequence[Present]) -> FloatArray | float:
+    """Return what these effects add to the twist [n], rad."""
+    x = ArrayFunctions()
+    return sum(
+        (
+            p.effect.twist_rad(
+                p.values, s.state_of(p.effect, p.values), relative_to(p.effect, p.values, s), x
+            )
+            for p in present
+        ),
+        0.0,
+    )
 
 
 def _sum(s: JointSignals, present: Sequence[Present], balance: str) -> FloatArray | float:

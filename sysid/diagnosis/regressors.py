@@ -67,11 +67,15 @@ class EffectCandidate:
         return dict(self.term.combine([0.0] * self.size))
 
 
+def relative_to(effect: Effect, p: Values, s: JointSignals) -> Joint:
+    """Return the joint that parameters are relative to: with the values found, of the file for those that replace one."""
+    replaces = any(q.key and q.name in p for q in effect.parameters)
+    return s.joint if replaces or not s.believed else s.believed[0]
+
+
 def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatArray]:
     """Return what the effect with parameters p leaves in each balance of this joint [n], Nm; absent: nothing."""
-    joint, state, x = s.joint, s.state_of(effect, p), ArrayFunctions()
-    replaces = any(q.key and q.name in p for q in effect.parameters)
-    own = joint if replaces or not s.believed else s.believed[0]  # what the effect is relative to
+    joint, state, own, x = s.joint, s.state_of(effect, p), relative_to(effect, p, s), ArrayFunctions()
     out: dict[str, FloatArray] = {}
 
     def add(balance: str, value: FloatArray) -> None:

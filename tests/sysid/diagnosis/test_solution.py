@@ -45,6 +45,25 @@ def test_the_torsion_of_a_spring_that_hardens_by_its_own_stiffness_is_solved_for
     assert stiffness * d + damper == pytest.approx(s.state.torque_nm, abs=1e-6 * PLAIN.rated_torque_nm)
 
 
+@pytest.mark.parametrize("times", [0.5, 1.5, 3.0])
+def test_the_torsion_of_another_stiffness_does_not_grow_where_the_torque_is_quicker_than_the_link(
+    times: float,
+) -> None:
+    """What the twist accelerates of a heavy link twists the spring again: repeated, that grew without end."""
+    link = PLAIN.stiffness_nm_per_rad / (2.0 * np.pi * 10.0) ** 2
+    heavy = replace(PLAIN, link_inertia_kgm2=link, damping_nms_per_rad=0.0)
+    s = replace(signals(rigid_run(heavy, 0.3), heavy), torque_hz=100.0)
+    s.state.torque_nm = 0.3 * PLAIN.rated_torque_nm * np.sin(2.0 * np.pi * 40.0 * s.time_s)
+    stiffness = times * PLAIN.stiffness_nm_per_rad
+    set_state(
+        s,
+        [Present("nonlinear_stiffness", 1, {"stiffness_nm_per_rad": stiffness, "cubic_nm_per_rad3": 0.0})],
+    )
+    assert stiffness * s.state.torsion_rad == pytest.approx(
+        s.state.torque_nm, abs=0.01 * PLAIN.rated_torque_nm
+    )
+
+
 @pytest.mark.filterwarnings("error")
 def test_the_torsion_of_a_spring_that_cannot_hold_the_torque_stays_finite() -> None:
     """A softening spring holds no more than its peak; the search tries such values, and steps to them overflowed."""
