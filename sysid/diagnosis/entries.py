@@ -276,8 +276,13 @@ def set_state(s: JointSignals, present: Sequence[Present]) -> None:
 
 
 def _set_torsion(s: JointSignals, mine: Sequence[Present]) -> None:
-    """Set the twist of the spring: errors of teeth and encoders are between the encoders, too, and load it with nothing."""
-    loading = [p for p in mine if "link_rad" not in p.effect.hooks and not p.effect.geometric]
+    """Set the twist of the spring: what is an angle of its own, whatever the spring, is between the encoders beside it."""
+    angles = {"twist_rad", "link_rad"}
+    loading = [
+        p
+        for p in mine
+        if not angles & set(p.effect.hooks) or "joint" in fields_used(p.effect, p.values, s.joint)
+    ]
     bent = [p for p in loading if "torsion_rad" in p.effect.needs]
     stiffness = s.joint.stiffness_nm_per_rad
     total = s.state.torque_nm + _sum(s, [p for p in loading if p not in bent], TORSION)

@@ -45,6 +45,39 @@ def test_the_torsion_of_a_spring_that_hardens_by_its_own_stiffness_is_solved_for
     assert stiffness * d + damper == pytest.approx(s.state.torque_nm, abs=1e-6 * PLAIN.rated_torque_nm)
 
 
+@pytest.mark.parametrize("times", [0.7, 1.0, 1.4])
+@pytest.mark.parametrize("name", ["lost_motion", "hysteresis"])
+def test_play_and_slip_are_beside_a_spring_of_another_stiffness(name: str, times: float) -> None:
+    """K' (twist - w/2) = tau with the true width, and K' twist + H z = tau with the true torque."""
+    joint = replace(PLAIN, damping_nms_per_rad=0.0)
+    table, stiffness = rigid_run(joint, stiffness=times), times * joint.stiffness_nm_per_rad
+    c, usual = table.joints[1], joint.rated_torque_nm / joint.stiffness_nm_per_rad
+    through = signals(table, joint).state.torque_nm
+    assert c.motor_position_rad is not None
+    width, force, travel = 0.1 * usual, 0.05 * joint.rated_torque_nm, 0.02 * usual
+    slip = np.zeros(len(through))
+    for k in range(1, len(slip)):  # both springs bend until the slip is at its end
+        bend = (through[k] - through[k - 1]) / (stiffness + force / travel)
+        slip[k] = np.clip(slip[k - 1] + bend / travel, -1.0, 1.0)
+    more, values = {
+        "lost_motion": (0.5 * width * np.sign(through), {"width_rad": width}),
+        "hysteresis": (-force / stiffness * slip, {"torque_nm": force, "travel_rad": travel}),
+    }[name]
+    position = c.motor_position_rad + joint.gear_ratio * more
+    s = signals(RunTable(table.time_s, {1: replace(c, motor_position_rad=position)}), joint)
+    present = [
+        Present(name, 1, values),
+        Present("nonlinear_stiffness", 1, {"stiffness_nm_per_rad": stiffness, "cubic_nm_per_rad3": 0.0}),
+    ]
+    set_state(s, present)
+    assert s.torsion_nm is not None
+    left = s.torsion_nm - sum(contribution(p.effect, p.values, s)["torsion"] for p in present)
+    loaded = np.abs(through) > 0.1 * joint.rated_torque_nm  # in the play nothing is known
+    loaded[:100] = loaded[-100:] = False
+    part = contribution(present[0].effect, values, s)["torsion"]
+    assert np.std(left[loaded]) < 0.05 * np.std(part[loaded])
+
+
 @pytest.mark.parametrize("times", [0.5, 1.5, 3.0])
 def test_the_torsion_of_another_stiffness_does_not_grow_where_the_torque_is_quicker_than_the_link(
     times: float,
