@@ -29,7 +29,7 @@ from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.findings import JointName, Present, shows_at
 from jtqd.sysid.diagnosis.limits import Prior, Usage
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, contribution, fields_used, relative_to
-from jtqd.sysid.diagnosis.signals import JointSignals, held_by_spring
+from jtqd.sysid.diagnosis.signals import SLOPE, JointSignals, held_by_spring
 from jtqd.sysid.diagnosis.smoothing import first_difference
 
 _MOST_STEPS: Final = 8
@@ -251,7 +251,8 @@ def set_state(s: JointSignals, present: Sequence[Present]) -> None:
         for p in mine
         if p.joint == s.number and all(q.key for q in p.effect.parameters)
     )
-    s.believed[:] = [with_effects_applied(replace(s.joint, effects=values))]
+    s.believed.joint = with_effects_applied(replace(s.joint, effects=values))
+    s.believed.loss_per_torque = _loss_per_torque(s, mine)
     _set_torsion(s, mine)
     reads = [p for p in mine if "current_a" in p.effect.hooks]  # more or later than what drives the motor
     mine = [p for p in mine if p not in reads]
@@ -275,6 +276,22 @@ def set_state(s: JointSignals, present: Sequence[Present]) -> None:
     s.state.current_rate_a_s = first_difference(s.state.current_a + more_a, s.time_s)  # of the reading
 
 
+def _loss_per_torque(s: JointSignals, mine: Sequence[Present]) -> FloatArray | float:
+    """Return d loss / d torque of these effects [n], over +-SLOPE of the rated torque."""
+    losing = [
+        p
+        for p in mine
+        if "loss_nm" in p.effect.hooks and "torque_nm" in fields_used(p.effect, p.values, s.joint)
+    ]
+    torque, wide = s.state.torque_nm, SLOPE * s.joint.rated_torque_nm
+    s.state.torque_nm = torque + wide
+    ahead = _sum(s, losing, MOTOR)
+    s.state.torque_nm = torque - wide
+    behind = _sum(s, losing, MOTOR)
+    s.state.torque_nm = torque
+    return (ahead - behind) / (2.0 * wide)
+
+
 def _set_torsion(s: JointSignals, mine: Sequence[Present]) -> None:
     """Set the twist of the spring: what is an angle of its own, whatever the spring, is between the encoders beside it."""
     angles = {"twist_rad", "link_rad"}
@@ -286,7 +303,7 @@ def _set_torsion(s: JointSignals, mine: Sequence[Present]) -> None:
     bent = [p for p in loading if "torsion_rad" in p.effect.needs]
     stiffness = s.joint.stiffness_nm_per_rad
     total = s.state.torque_nm + _sum(s, [p for p in loading if p not in bent], TORSION)
-    total = held_by_spring(s.believed[0], total, s.time_s)
+    total = held_by_spring(s.believed.joint or s.joint, total, s.time_s)
     s.state.torsion_rad = total / stiffness
     if not bent:
         return

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects.effect import Linear
+from jtqd.estimator.effects.effect import MOTOR, Linear
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.dataset import Dataset, binned_runs, unpowered_columns, with_readings
 from jtqd.sysid.diagnosis.entries import (
@@ -33,6 +33,7 @@ from jtqd.sysid.diagnosis.entries import (
 from jtqd.sysid.diagnosis.evidence import Equations, Means, Set, Sets, columns_of
 from jtqd.sysid.diagnosis.findings import Present, shows_at
 from jtqd.sysid.diagnosis.regressors import (
+    OF_TORQUE,
     ChannelData,
     Index,
     Noise,
@@ -42,6 +43,7 @@ from jtqd.sysid.diagnosis.regressors import (
     features,
     fields_used,
     noise_of_channels,
+    nuisances_of,
     run_sums,
     seen_in_bins,
 )
@@ -55,7 +57,9 @@ _CLIMB: Final = 4
 """Steps to a neighbouring set."""
 _FROM_NOTHING: Final = 2
 """Turns that search from the empty set as well."""
-_STATES: Final = frozenset({"current_a", "current_rate_a_s", "torsion_rad", "torsion_rate_rad_s", "joint"})
+_STATES: Final = frozenset(
+    ("current_a", "current_rate_a_s", "torsion_rad", "torsion_rate_rad_s", "joint", "loss_per_torque")
+)
 """What effects use that follows from the solution."""
 _SETTLING: Final = 6
 _SETTLED: Final = 0.1
@@ -494,6 +498,13 @@ class _Work:
                         change = limits.SHAPE / _STEP * (two[balance] - one[balance])
                         made.setdefault(Channel(s.number, balance), []).append((column, change))
         of = {s.number: s for s in signals}
+        for s in signals:
+            d = run.channels[Channel(s.number, MOTOR)]
+            torque = nuisances_of(s, MOTOR, self.dataset.families, OF_TORQUE)
+            numbers, values = seen_in_bins(s, torque, run.samples)
+            nuisances = d.nuisances.copy()
+            nuisances[:, np.searchsorted(d.families, numbers)] = values
+            run.channels[Channel(s.number, MOTOR)] = replace(d, nuisances=nuisances)
         for channel, columns in made.items():
             d = run.channels[channel]
             place = {int(k): j for j, k in enumerate(d.index)}

@@ -70,7 +70,7 @@ class EffectCandidate:
 def relative_to(effect: Effect, p: Values, s: JointSignals) -> Joint:
     """Return the joint that parameters are relative to: with the values found, of the file for those that replace one."""
     replaces = any(q.key and q.name in p for q in effect.parameters)
-    return s.joint if replaces or not s.believed else s.believed[0]
+    return s.joint if replaces or s.believed.joint is None else s.believed.joint
 
 
 def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatArray]:
@@ -124,7 +124,9 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
 
 
 def fields_used(effect: Effect, p: Values, joint: Joint) -> frozenset[str]:
-    """Return the fields of the state that the hooks of an effect use, and "joint" where a value of the file is one."""
+    """Return the fields of the state that the hooks of an effect use, "joint" where a value of the file is one, and
+    "loss_per_torque" where it loads the gear.
+    """
     seen: set[str] = set()
 
     class Recorder:
@@ -140,7 +142,9 @@ def fields_used(effect: Effect, p: Values, joint: Joint) -> frozenset[str]:
 
     for hook in effect.hooks:
         getattr(effect, hook)(p, Recorder(), File(), ScalarFunctions())
-    return frozenset(seen & {*State.__slots__, "joint"})
+    if any(hook in effect.hooks for hook in ("load_nm", "sensor_nm", "twist_rad", "link_rad")):
+        seen.add("loss_per_torque")
+    return frozenset(seen & {*State.__slots__, "joint", "loss_per_torque"})
 
 
 def bin_samples(signals: Iterable[JointSignals]) -> int:
@@ -267,6 +271,8 @@ _ZERO: Final = 0.0025
 """Prior standard deviation of a run's own sensor zero, part of the rated torque."""
 _SMOOTHING: Final = {"smoothing": 1, "smoothing_quartic": 2}
 """Of a computed torque: how often it is differentiated twice."""
+OF_TORQUE: Final = ("zero", *_SMOOTHING)
+"""Families of the torque, in the motor balance by what it costs there (`JointSignals.per_torque`)."""
 _SMOOTHED: Final = 0.3
 """Prior standard deviation of the part that its smoothing took of it at COMPUTED_HZ."""
 _SHARE: Final = {"smooth": 0.3, "viscous": 0.08, "coulomb": 0.02}
@@ -318,6 +324,14 @@ def usual_friction(signals: Sequence[JointSignals]) -> dict[str, float]:
     }
 
 
+def nuisances_of(
+    s: JointSignals, balance: str, groups: Sequence[Family], names: Iterable[str] | None = None
+) -> list[tuple[int, FloatArray]]:
+    """Return the columns [n] of families in one channel with their numbers; names: of these alone."""
+    made = [(k, _nuisance(s, balance, g)) for k, g in enumerate(groups) if names is None or g.name in names]
+    return [(k, c) for k, c in made if c is not None]
+
+
 def _nuisance(s: JointSignals, balance: str, family: Family) -> FloatArray | None:
     """Return the column of one family in one channel, None where it has none."""
     if family.joint not in {0, s.number}:
@@ -358,9 +372,8 @@ def run_data(
                 continue
             channel = Channel(s.number, balance)
             valid, known = (all_in_bin(x, samples) for x in (s.usable(balance), s.known(balance)))
-            nuisances = [(k, _nuisance(s, balance, g)) for k, g in enumerate(groups)]
             index, regressors = seen_in_bins(s, made.get(channel, ()), samples)
-            own, changes = seen_in_bins(s, [(k, c) for k, c in nuisances if c is not None], samples)
+            own, changes = seen_in_bins(s, nuisances_of(s, balance, groups), samples)
             worth = binned(s.held_nm[balance], samples) if balance in s.held_nm else np.zeros(len(known))
             channels[channel] = ChannelData(
                 valid,

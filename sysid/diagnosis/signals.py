@@ -43,7 +43,7 @@ from jtqd.sysid.diagnosis.smoothing import (
 )
 from jtqd.sysid.runs.bad_samples import Held
 
-_SLOPE: Final = 0.0075
+SLOPE: Final = 0.0075
 """Part of the rated torque over which the losses' slope is taken: as wide as zeros of torque sensors are."""
 
 
@@ -56,7 +56,7 @@ class BaseLoss:
 
     def __init__(self, joint: Joint) -> None:
         self._friction: Final = joint.friction
-        self._slope_nm: Final = _SLOPE * joint.rated_torque_nm
+        self._slope_nm: Final = SLOPE * joint.rated_torque_nm
         self.depends_on_load: Final = joint.efficiency is not None
         self._rows: tuple[FloatArray, FloatArray] | None = None
         if joint.efficiency is not None:
@@ -96,7 +96,7 @@ class BaseLoss:
         return signed
 
     def slope(self, torque_nm: FloatArray, velocity_rad_s: FloatArray) -> FloatArray:
-        """Return d loss / d torque [n], zero without efficiency; over +-_SLOPE of the rated torque, so that the grid of the
+        """Return d loss / d torque [n], zero without efficiency; over +-SLOPE of the rated torque, so that the grid of the
         table does not show.
         """
         if self._rows is None:
@@ -156,14 +156,23 @@ _SURELY: Final = 3.0
 """Standard deviations."""
 
 
+@dataclass
+class Believed:
+    """What a set makes of a joint: joint: with the values found, None for those of the file: effects are relative to it;
+    loss_per_torque: d loss / d torque of its effects.
+    """
+
+    joint: Joint | None = None
+    loss_per_torque: FloatArray | float = 0.0
+
+
 @dataclass(frozen=True)
 class JointSignals:
     """One joint of one run, arrays [n] at the run's own rate.
 
     number: joint; state: what hooks use; motor_nm, torsion_nm: residuals of the two balances [Nm] (torsion None: one
-    encoder only); moving: samples at which friction has a direction; per_torque: by how much the motor residual falls per Nm
-    that the sensor reads too high, 1 where the losses know no load (`about_zero`); off: samples at which the power stage is
-    off (None: not recorded).
+    encoder only); moving: samples at which friction has a direction; loss_per_torque: d loss / d torque of the joint file
+    (`about_zero`); off: samples at which the power stage is off (None: not recorded).
     """
 
     run: str
@@ -177,7 +186,7 @@ class JointSignals:
     sensor_nm: FloatArray
     current_a: FloatArray
     quick_nm: FloatArray  # what of the torque that motion and load need is too quick to be known
-    per_torque: FloatArray | float = 1.0
+    loss_per_torque: FloatArray | float = 0.0
     twist_rad: FloatArray | None = None  # theta_m/G - theta_l less its zero, smoothed
     # what a step of an angle is worth in torsion
     rounded_nm: FloatArray = field(default_factory=lambda: np.zeros(1))
@@ -189,7 +198,7 @@ class JointSignals:
     sensor_temperature_c: FloatArray | None = None  # None: that of this joint (`with_one_sensor`)
     visible: Smoother = _ALL_VISIBLE  # what it leaves of both balances is judged, and of their regressors
     known_motion: Smoother = _ALL_VISIBLE  # what the noise of the motion leaves of them
-    believed: list[Joint] = field(default_factory=list)  # with the values found: effects are relative to it
+    believed: Believed = field(default_factory=Believed)
     torque_hz: float = math.inf  # torques in regressors are known below it
     coarse: str = ""  # what the resolution of the recording costs, "" for nothing
 
@@ -202,6 +211,11 @@ class JointSignals:
     def nm_per_a(self) -> float:
         """Motor torque per current, joint side: G Kt of the joint file."""
         return self.joint.gear_ratio * self.joint.torque_constant_nm_per_a
+
+    @property
+    def per_torque(self) -> FloatArray | float:
+        """By how much the motor residual falls per Nm that the sensor reads too high, and rises per Nm of a further load."""
+        return 1.0 + self.loss_per_torque + self.believed.loss_per_torque
 
     @property
     def demand_nm(self) -> FloatArray:
@@ -565,7 +579,7 @@ _OF_A_GUESS: Final = "direction", "velocity_rad_s", "current_a", "motor_accelera
 
 
 def about_zero(run: Sequence[JointSignals], bases: Mapping[int, BaseLoss]) -> list[JointSignals]:
-    """Return the signals of one run's joints with motor residual and `per_torque` expanded about the sensor's zero of the
+    """Return the signals of one run's joints with motor residual and losses expanded about the sensor's zero of the
     run, where the losses depend on the load.
 
     The simulation takes its losses at the measured torque, so a zero z of the sensor is in the residual twice: as -z, and
@@ -590,7 +604,7 @@ def _expanded(s: JointSignals, base: BaseLoss, zero_nm: float) -> JointSignals:
     true = torque - zero_nm
     slope = base.slope(true, velocity)
     less = base.loss(torque, velocity) - base.loss(true, velocity) - slope * zero_nm
-    return replace(s, motor_nm=s.motor_nm + less, per_torque=1.0 + slope)
+    return replace(s, motor_nm=s.motor_nm + less, loss_per_torque=slope)
 
 
 def _first_guess(run: Sequence[JointSignals]) -> float:

@@ -97,6 +97,37 @@ def test_the_torsion_of_another_stiffness_does_not_grow_where_the_torque_is_quic
     )
 
 
+@pytest.mark.parametrize("name", ["sensor_offset", "link_inertia", "unbalance"])
+def test_a_torque_that_loads_the_gear_is_in_its_losses_too(name: str) -> None:
+    """Losses of 0.25 |tau|: what a zero or a further load is worth in the motor balance is 1 +- 0.25 of it."""
+    zero, link, moment = (
+        0.02 * PLAIN.rated_torque_nm,
+        2.0 * PLAIN.link_inertia_kgm2,
+        0.03 * PLAIN.rated_torque_nm,
+    )
+    truth = replace(PLAIN, link_inertia_kgm2=link) if name == "link_inertia" else PLAIN
+    table = rigid_run(truth)
+    c, seen = table.joints[1], signals(table, truth)
+    assert c.current_a is not None
+    assert c.torque_nm is not None
+    weight = moment * np.sin(seen.state.link_position_rad) if name == "unbalance" else 0.0 * c.torque_nm
+    through = seen.state.torque_nm + weight
+    current = c.current_a + (weight + 0.25 * np.abs(through) * seen.state.direction) / seen.nm_per_a
+    reading = c.torque_nm + (zero if name == "sensor_offset" else 0.0)
+    s = signals(RunTable(table.time_s, {1: replace(c, current_a=current, torque_nm=reading)}))
+    own = {
+        "sensor_offset": ("sensor", {"offset_nm": zero}),
+        "link_inertia": (1, {"link_inertia_kgm2": link}),
+        "unbalance": (1, {"moment_nm": moment, "phase_rad": 0.0}),
+    }[name]
+    present = [Present(name, *own), Present("load_dependent_friction", 1, {"load_coefficient": 0.25})]
+    set_state(s, present)
+    explained = sum(contribution(p.effect, p.values, s)["motor"] for p in present)
+    left = (s.motor_nm - explained)[s.moving]
+    part = contribution(present[0].effect, present[0].values, s)["motor"][s.moving]
+    assert np.std(left) < 0.2 * 0.25 * np.sqrt(np.mean(part**2))
+
+
 @pytest.mark.filterwarnings("error")
 def test_the_torsion_of_a_spring_that_cannot_hold_the_torque_stays_finite() -> None:
     """A softening spring holds no more than its peak; the search tries such values, and steps to them overflowed."""
