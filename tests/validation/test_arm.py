@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from functools import cache
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -25,7 +26,7 @@ from validation.arm.arm import (
     read,
     rigid,
 )
-from validation.arm.baseline import Baseline, Dynamics
+from validation.arm.baseline import Baseline, Dynamics, best_payload
 from validation.arm.judge import tool_jacobians
 from validation.arm.trial import (
     ERRORS,
@@ -401,6 +402,22 @@ def test_a_drawer_refuses_what_is_too_heavy_or_too_fast() -> None:
     stretched = np.array([0.0, 1.35, 0.0, -0.6, 0.0, 1.9, 0.0])
     assert not drawer.possible(stretched[None], 1.0)
     assert not drawer.possible(np.array([LIGHT, LIGHT + 0.3, LIGHT + 0.6]), 0.1)
+
+
+def test_a_payload_is_found_where_the_model_is_true() -> None:
+    arm = Arm("typical", 5)
+    load = Payload(1.4, (0.02, -0.03, 0.05))
+    run = Run(0, swing(3.0), load)
+    truth = arm.record([run])[0]
+    for offset, close, near in ((0.0, 0.01, 0.004), (0.4, 0.05, 0.012)):
+
+        def joints(*_: Any, off: float = offset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            sigma = np.broadcast_to(0.0056 * arm.rated_nm, truth.drive_nm.shape)
+            return truth.drive_nm + off * sigma, sigma, np.ones(sigma.shape, np.int8)
+
+        found = best_payload(arm, truth, read(arm, run, truth, joints), "typical")
+        assert found.mass_kg == pytest.approx(load.mass_kg, rel=close)
+        assert found.centre_m == pytest.approx(load.centre_m, abs=near)
 
 
 def test_the_baseline_finds_friction_payload_and_pushes() -> None:

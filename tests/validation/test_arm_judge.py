@@ -226,10 +226,12 @@ def test_payload_is_read_after_learning_and_missing_is_wrong() -> None:
     out = perfect()
     out.payload_kg[:], out.centre_m[:] = 2.1, np.add(LOAD.centre_m, (0.0, 0.03, 0.04))
     made = figures([found(out)], "typical")
-    assert made.mass == pytest.approx(0.05)
-    assert made.centre_m == pytest.approx(0.05)
+    assert made.mass == pytest.approx((0.05, 0.05))
+    assert made.centre_m == pytest.approx((0.05, 0.05))
+    best = found(perfect())
+    assert figures([found(out), best, best], "typical").mass == pytest.approx((0.0, 0.05))
     out.payload_kg[: at(LEARN_S) + 1] = np.nan
-    assert figures([found(out)], "typical").mass == np.inf
+    assert figures([found(out)], "typical").mass == (np.inf, np.inf)
     one = day()
     light = judge(one.arm, one.run._replace(payload=Payload(0.3)), one.truth, one.readings, out)
     assert np.isnan(light.mass_off)
@@ -309,7 +311,10 @@ def test_the_study_ends_with_three_where_a_limit_is_missed(
             "baseline": [found(dull._replace(external_nm=dull.external_nm + 0.1 * day().arm.rated_nm))],
         }
         return study.Done(
-            work.plant, {name: runs[name] for name in work.methods}, dict.fromkeys(work.methods, 1.0)
+            work.plant,
+            {name: runs[name] for name in work.methods},
+            [(0.01, 0.004)],
+            dict.fromkeys(work.methods, 1.0),
         )
 
     monkeypatch.setattr(study, "judged", judged)

@@ -10,16 +10,16 @@ Its payload is found by least squares over the first LEARN_S; it reports contact
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 from scipy.signal import lfilter, savgol_filter
 
-from validation.arm.arm import CYCLE_S, JOINTS, Arm, Array, Payload, Readings, rigid
+from validation.arm.arm import CYCLE_S, JOINTS, Arm, Array, Payload, Readings, Truth, rigid
 from validation.arm.judge import Published, nothing, tool_jacobians, wrench_information
-from validation.arm.trial import LEARN_S
+from validation.arm.trial import ERRORS, LEARN_S
 
 GAIN: Final = 50.0
 """K [1/s]."""
@@ -30,6 +30,8 @@ SLOW_RAD_S: Final = 0.02
 MARGIN: Final = 1.2
 """Threshold over the largest residual of the identification."""
 EVERY: Final = 10
+LASTING: Final = 50.0
+"""So many samples of EVERY are as wrong as one."""
 
 
 class Dynamics:
@@ -124,21 +126,9 @@ class Baseline:
         return np.asarray(lfilter([share], [1.0, share - 1.0], wanted, axis=0))
 
     def _payload(self, readings: Readings) -> Payload:
-        """Return the payload that explains the torques of readings best: m and m c, of a point at first."""
         q, v, a, driving = self._smooth(readings)
-        unexplained = driving - self.rotor * a - self._rubbing(v) - self.empty.inverse(q, v, a)
-        without, small = self.empty.inverse(q, v, a), 1e-3
-        at = [
-            Dynamics(rigid(payload=Payload(1.0, centre))).inverse(q, v, a) - without
-            for centre in _corners(small)
-        ]
-        columns = (
-            np.stack([at[0], *((each - at[0]) / small for each in at[1:])], axis=-1) / self.rated[:, None]
-        )
-        found = np.linalg.lstsq(columns.reshape(-1, 4), (unexplained / self.rated).ravel(), rcond=None)[0]
-        mass = max(float(found[0]), 0.0)
-        centre = np.clip(found[1:] / max(mass, 0.1), -0.3, 0.3)
-        return Payload(mass, (float(centre[0]), float(centre[1]), float(centre[2])))
+        torque = driving - self.rotor * a - self._rubbing(v)
+        return fit_payload(lambda payload: rigid(payload=payload), (q, v, a), torque, self.rated)
 
     def run(self, readings: Readings) -> Published:
         """Return what it publishes of a day."""
@@ -162,5 +152,45 @@ class Baseline:
         return out
 
 
-def _corners(small: float) -> list[tuple[float, float, float]]:
-    return [(0.0, 0.0, 0.0), (small, 0.0, 0.0), (0.0, small, 0.0), (0.0, 0.0, small)]
+def fit_payload(
+    model: Callable[[Payload], Any],
+    motion: tuple[Array, Array, Array],
+    torque_nm: Array,
+    sigma_nm: Array,
+    offset: float = 0.0,
+) -> Payload:
+    """Return the payload that explains torques [n, 7] of a motion q, v, a [n, 7] best: m and m c, of a point at first.
+
+    offset: what is constant in the torques, standard deviation in sigmas [7]; samples of LASTING count as one.
+    """
+    without, small = Dynamics(model(Payload())).inverse(*motion), 1e-3
+    corners = ((0.0, 0.0, 0.0), (small, 0.0, 0.0), (0.0, small, 0.0), (0.0, 0.0, small))
+    at = [Dynamics(model(Payload(1.0, corner))).inverse(*motion) - without for corner in corners]
+    columns = np.stack([at[0], *((each - at[0]) / small for each in at[1:])], axis=-1)
+    constant = np.broadcast_to(np.eye(JOINTS), (*torque_nm.shape, JOINTS)) * offset * sigma_nm
+    every = np.concatenate((columns, constant), axis=-1) / sigma_nm[:, None] / np.sqrt(LASTING)
+    left = ((torque_nm - without) / sigma_nm / np.sqrt(LASTING)).ravel()
+    prior = np.diag([0.0] * 4 + [1.0] * JOINTS)
+    x = np.concatenate((every.reshape(-1, 4 + JOINTS), prior))
+    found = np.linalg.lstsq(x, np.concatenate((left, np.zeros(len(prior)))), rcond=None)[0]
+    mass = max(float(found[0]), 0.0)
+    centre = np.clip(found[1:4] / max(mass, 0.1), -0.3, 0.3)
+    return Payload(mass, (float(centre[0]), float(centre[1]), float(centre[2])))
+
+
+def best_payload(arm: Arm, truth: Truth, readings: Readings, plant: str) -> Payload:
+    """Return the payload that the joints' torques of the first LEARN_S tell to who has the true model and motion."""
+    learned = round(LEARN_S / CYCLE_S)
+
+    def fitted(x: Array, deriv: int = 0) -> Array:
+        return np.asarray(
+            savgol_filter(x[:learned], SMOOTHED, 3, deriv=deriv, delta=CYCLE_S, axis=0)[SMOOTHED::EVERY]
+        )
+
+    torque, sigma = fitted(readings.torque_nm), np.nanmean(readings.sigma_nm[:learned], axis=0)
+    told = np.isfinite(torque).all(axis=1)
+    q, v, a = fitted(truth.link_rad), fitted(truth.link_rad_s), fitted(truth.link_rad_s, 1)
+    parts = ERRORS[plant][1]
+    return fit_payload(
+        arm.model, (q[told], v[told], a[told]), torque[told], sigma, float(np.sqrt(parts[0] + parts[2]))
+    )

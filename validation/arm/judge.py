@@ -41,6 +41,7 @@ INSIDE: Final = (0.84, 0.95)
 PUBLISHED: Final = 0.95
 """Share of cycles, and of well-conditioned poses, that have a value: else leaving out what is hard would be rewarded."""
 MASS, CENTRE_M = 0.03, 0.01
+"""Of half of the days: 10 s of some motions tell little, whoever looks (`baseline.best_payload`)."""
 WITHIN_S: Final = {"push": 0.02, "clamp": 0.3}
 """Reported within so long of full force."""
 DETECTED: Final = 0.95
@@ -265,15 +266,15 @@ class Row(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """All runs of one method together; shares are of 1."""
+    """All runs of one method together; shares are of 1. mass, centre_m: half of the days, and nine of ten, are within."""
 
     rms: Array
     pushed: Array
     inside: Array
     published: float
     told: tuple[int, int]
-    mass: float
-    centre_m: float
+    mass: tuple[float, float]
+    centre_m: tuple[float, float]
     detected: dict[str, tuple[int, int]]
     delay_s: dict[str, float]
     alarms: int
@@ -307,8 +308,8 @@ def figures(found: Sequence[Found], plant: str) -> Figures:
         inside / np.maximum(published, 1),
         float((published / np.maximum(cycles, 1)).min()),
         (sum(each.told for each in found), sum(each.silent for each in found)),
-        _rms([each.mass_off for each in heavy]),
-        _rms([each.centre_off_m for each in heavy]),
+        _within_of([each.mass_off for each in heavy]),
+        _within_of([each.centre_off_m for each in heavy]),
         {kind: _within(events, kind, limit) for kind, limit in WITHIN_S.items()},
         {kind: _median([e.delay_s for e in events if _counts(e, kind)]) for kind in WITHIN_S},
         sum(each.alarms for each in found),
@@ -344,8 +345,9 @@ def _share(good: Sequence[bool]) -> tuple[int, int]:
     return sum(good), len(good)
 
 
-def _rms(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else np.nan
+def _within_of(values: Sequence[float]) -> tuple[float, float]:
+    half, most = np.quantile(values, (0.5, 0.9), method="higher") if len(values) else (np.nan, np.nan)
+    return float(half), float(most)
 
 
 def _median(values: Sequence[float]) -> float:
@@ -385,12 +387,17 @@ def rows(plant: str, made: Sequence[Figures], cost_us: float = np.nan) -> list[R
             [percent(f.told[0] / f.told[1]) if f.told[1] else "none" for f in made],
             one.told[0] == 0,
         ),
-        Row("payload, mass, rms", f"{100 * MASS:.0f} %", [percent(f.mass) for f in made], one.mass <= MASS),
         Row(
-            "payload, centre, rms",
+            "payload, mass: half of the days; nine of ten",
+            f"{100 * MASS:.0f} %",
+            [f"{percent(f.mass[0])}; {percent(f.mass[1])}" for f in made],
+            one.mass[0] <= MASS,
+        ),
+        Row(
+            "payload, centre: half of the days; nine of ten",
             f"{100 * CENTRE_M:g} cm",
-            [f"{100 * f.centre_m:.2f} cm" for f in made],
-            one.centre_m <= CENTRE_M,
+            [f"{100 * f.centre_m[0]:.1f}; {100 * f.centre_m[1]:.1f} cm" for f in made],
+            one.centre_m[0] <= CENTRE_M,
         ),
     ]
     for kind, limit in WITHIN_S.items():

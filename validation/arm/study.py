@@ -22,8 +22,9 @@ import numpy as np
 
 from jtqd.estimator.command_line import count, natural
 from validation.arm.arm import CYCLE_S, Joints, Readings, Run, Truth, read
-from validation.arm.baseline import Baseline
+from validation.arm.baseline import Baseline, best_payload
 from validation.arm.judge import (
+    LIGHTEST_KG,
     Figures,
     Found,
     Published,
@@ -36,7 +37,7 @@ from validation.arm.judge import (
     zero,
 )
 from validation.arm.trial import ERRORS, LEARN_S, QUIET_S, Trial, batches, error_process
-from validation.study import Report, Table, in_processes
+from validation.study import Report, Table, in_processes, percent
 
 SEED: Final = 38021
 """Of the judging days; 38001 to 38020 are for practice."""
@@ -61,10 +62,11 @@ class Work(NamedTuple):
 
 
 class Done(NamedTuple):
-    """What the runs tell by method, and the processor time of a cycle."""
+    """What the runs tell by method; best: errors of payloads as `best_payload` finds them; processor time of a cycle."""
 
     plant: str
     found: dict[str, list[Found]]
+    best: list[tuple[float, float]]
     cost_us: dict[str, float]
 
 
@@ -89,18 +91,23 @@ def judged(work: Work) -> Done:
     }
     found: dict[str, list[Found]] = {name: [] for name in work.methods}
     spent, cycles = dict.fromkeys(work.methods, 0.0), 0
+    best = []
     for days, drawn in ((work.days, trial.contact), (work.quiet, trial.quiet)):
         for part in batches(days, AT_ONCE):
             runs = [drawn(day) for day in part]
             for run, truth in zip(runs, arm.record(runs), strict=True):
                 readings = read(arm, run, truth, joints)
                 cycles += len(readings.time_s)
+                if run.contacts and run.payload.mass_kg >= LIGHTEST_KG:
+                    payload = best_payload(arm, truth, readings, work.plant)
+                    away = np.linalg.norm(np.subtract(payload.centre_m, run.payload.centre_m))
+                    best.append((abs(payload.mass_kg / run.payload.mass_kg - 1.0), float(away)))
                 for name in work.methods:
                     begin = time.process_time()
                     published = made[name](run, truth, readings)
                     spent[name] += time.process_time() - begin
                     found[name].append(judge(arm, run, truth, readings, published))
-    return Done(work.plant, found, {name: 1e6 * spent[name] / max(cycles, 1) for name in work.methods})
+    return Done(work.plant, found, best, {name: 1e6 * spent[name] / max(cycles, 1) for name in work.methods})
 
 
 def works(options: argparse.Namespace) -> list[Work]:
@@ -148,7 +155,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Report:
     work = works(options)
     done = list(in_processes(judged, work, options.jobs, "arms"))
-    tables, values, reached = [], {}, True
+    tables, values, notes, reached = [], {}, list(NOTES), True
     for plant in dict.fromkeys(each.plant for each in work):
         own = [each for each in done if each.plant == plant]
         names = list(own[0].found)
@@ -156,18 +163,27 @@ def run(options: argparse.Namespace) -> Report:
         cost = float(np.mean([each.cost_us[names[0]] for each in own]))
         found = rows(plant, made, np.nan if names[0] in METHODS else cost)
         reached = reached and all(row.reached is not False for row in found)
+        notes.append(_noted(plant, [one for each in own for one in each.best]))
         tables += [
             _table(found, names, f"{plant}: {_sizes(own[0].found[names[0]], len(own))}"),
             _curve(made, names),
         ]
         values[plant] = dict(zip(names, (each._asdict() for each in made), strict=True))
-    return Report(tables, {"trial": options.seed}, NOTES, values, reached)
+    return Report(tables, {"trial": options.seed}, notes, values, reached)
 
 
 NOTES: Final = (
     f"Days count after {LEARN_S:g} s of free motion, in which the payload may be learned; cycle {CYCLE_S:g} s.",
     "Link right: of contacts that the link's own joint can feel; the point where three joints are before it.",
 )
+
+
+def _noted(plant: str, best: Sequence[tuple[float, float]]) -> str:
+    """Return what the figures of payloads would be with the true model and motion."""
+    if not best:
+        return f"{plant}: no payload to be found"
+    mass, centre = np.median(best, axis=0)
+    return f"{plant}: payload by least squares with the true model: half of the days {percent(mass)}, {100 * centre:.1f} cm"
 
 
 def _sizes(found: Sequence[Found], arms: int) -> str:
