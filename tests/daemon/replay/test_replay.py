@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import shutil
+import signal
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -38,7 +41,13 @@ VALUES = 4 + 24 + 16
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """2.2 s of jtqd on the emulated bench, method fused with networks, in real time: with whatever the machine did."""
-    directory = tmp_path_factory.mktemp("recorded")
+    return recorded(tmp_path_factory.mktemp("recorded"), 2.2)
+
+
+def recorded(
+    directory: Path, seconds: float, beside: Callable[[subprocess.Popen[str]], None] | None = None
+) -> Path:
+    """The log of a run; beside: what happens to its processes meanwhile, until they have ended."""
     content = shipped_bench()
     for number, data in networks().items():
         file = directory / f"joint{number}.fused.onnx"
@@ -48,21 +57,54 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "sha256": hashlib.sha256(data).hexdigest(),
         }
     (directory / "bench.yaml").write_text(yaml.safe_dump(content))
-    result = subprocess.run(
-        [
-            *(sys.executable, "-m", "jtqd.daemon.jtqd", "--bus", "sim", "--duration", "2.2"),
-            *("--config", str(directory / "bench.yaml"), "--record", str(directory / "logs"), "--json"),
-        ],
-        env={**os.environ, "RUNTIME_DIRECTORY": str(directory)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert result.returncode in (0, 3), result.stderr
+    command = [
+        *(sys.executable, "-m", "jtqd.daemon.jtqd", "--bus", "sim", "--duration", str(seconds)),
+        *("--config", str(directory / "bench.yaml"), "--record", str(directory / "logs"), "--json"),
+    ]
+    env = {**os.environ, "RUNTIME_DIRECTORY": str(directory)}
+    with (
+        (directory / "out").open("w") as out,
+        subprocess.Popen(command, env=env, stdout=out, stderr=subprocess.STDOUT, text=True) as process,
+    ):
+        if beside is not None:
+            beside(process)
+        process.wait(timeout=120)
+    said = (directory / "out").read_text()
+    assert process.returncode in (0, 3), said
     found = list((directory / "logs").glob("*.mcap"))
-    assert len(found) == 1, result.stdout + result.stderr
+    assert len(found) == 1, said
     return found[0]
+
+
+def stopped_at_times(process: subprocess.Popen[str]) -> None:
+    """Stop one of the processes below this one after the other, for 2 to 150 ms, until it ends."""
+    rng = np.random.default_rng(3)
+    while process.poll() is None:
+        below, every = [process.pid], list[int]()
+        while below:
+            try:
+                text = Path(f"/proc/{below[0]}/task/{below[0]}/children").read_text()
+            except OSError:  # it has ended
+                text = ""
+            every += (more := [int(pid) for pid in text.split()])
+            below = [*below[1:], *more]
+        for pid in every:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGSTOP)
+                time.sleep(float(rng.choice((0.002, 0.01, 0.04, 0.15))))
+                os.kill(pid, signal.SIGCONT)
+        time.sleep(0.05)
+
+
+@pytest.mark.native
+def test_processes_that_stood_still_cost_cycles_and_no_bit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = recorded(tmp_path, 3.0, stopped_at_times)
+    status, found, _ = run(capsys, file)
+    assert status == 0
+    assert found["identity"]["identical"] == found["cycles"] == len(cycles(file))
+    assert found["cycles"] < 2900, "the loop stood still at times"
 
 
 @pytest.mark.socketcan
