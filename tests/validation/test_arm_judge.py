@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -25,13 +26,14 @@ from validation.arm.judge import (
     free_cycles,
     judge,
     nothing,
+    of_the_past,
     oracle,
     rows,
     tool_jacobians,
     wrench_information,
     zero,
 )
-from validation.arm.trial import FALL_S, LEARN_S, error_process
+from validation.arm.trial import FALL_S, LEARN_S, Told, Trial, User, error_process
 
 POSE = np.array([0.3, -0.3, 0.0, -2.2, 0.0, 2.0, 0.4])
 LOAD = Payload(2.0, (0.01, -0.02, 0.05))
@@ -322,3 +324,46 @@ def test_the_study_ends_with_three_where_a_limit_is_missed(
     words = ["external_torque", "--quick", "--plant", "typical", "--method", method, "--json", str(out)]
     assert command.main(words) == status
     assert '"pushed"' in out.read_text(encoding="utf-8")
+
+
+def speechless(user: User) -> Callable[[Readings], Published]:
+    """An estimator that a user of the study brings: it says nothing, and counts how often it was asked."""
+    assert user.urdf.exists()
+    assert len(user.identification) == 2
+    return lambda readings: nothing(len(readings.time_s))
+
+
+def test_what_is_published_is_of_the_past_alone() -> None:
+    readings = day().readings
+
+    def mean(x: Readings) -> Published:
+        return nothing(len(x.time_s))._replace(external_nm=x.torque_nm - x.torque_nm.mean(axis=0))
+
+    def sum_so_far(x: Readings) -> Published:
+        return nothing(len(x.time_s))._replace(external_nm=np.cumsum(x.torque_nm, axis=0))
+
+    assert of_the_past(sum_so_far, readings, sum_so_far(readings))
+    assert not of_the_past(mean, readings, mean(readings))
+
+
+def test_the_study_takes_an_estimator_by_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Short(Trial):
+        def identification(self, runs: int = 2, seconds: float = 2.0) -> list[Told]:
+            return super().identification(runs, seconds)
+
+        def contact(self, day: int, seconds: float = 1.0) -> Run:
+            path = np.repeat(POSE[None], round(seconds / CYCLE_S), axis=0)
+            return Run(1000 + day, path, Payload())
+
+    monkeypatch.setattr(study, "Trial", Short)
+    name = "tests.validation.test_arm_judge:speechless"
+    done = study.judged(study.Work("typical", 38001, 0, [0], [], [name, "baseline", "zero"]))
+    assert done.past is True
+    assert done.found[name][0].published.sum() == 0
+    assert done.cost_us[name] > 0.0
+    assert len(done.found["zero"]) == 1
+    for wrong in ("nowhere.at:all", "tests.validation.test_arm_judge:nobody", "oracel"):
+        assert command.main(["external_torque", "--method", wrong]) == 2
+        assert len(capsys.readouterr().err.strip().splitlines()) == 1

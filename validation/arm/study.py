@@ -12,16 +12,17 @@ python -m validation external_torque --jobs 2            30 days and 3 quiet hou
 from __future__ import annotations
 
 import argparse
+import importlib
 import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
 import numpy as np
 
 from jtqd.estimator.command_line import count, natural
-from validation.arm.arm import CYCLE_S, Joints, Readings, Run, Truth, read
+from validation.arm.arm import CYCLE_S, URDF, Joints, Readings, Run, Truth, read
 from validation.arm.baseline import Baseline, best_payload
 from validation.arm.judge import (
     LIGHTEST_KG,
@@ -32,12 +33,13 @@ from validation.arm.judge import (
     curve_rows,
     figures,
     judge,
+    of_the_past,
     oracle,
     rows,
     zero,
 )
-from validation.arm.trial import ERRORS, LEARN_S, QUIET_S, Trial, batches, error_process
-from validation.study import Report, Table, in_processes, percent
+from validation.arm.trial import ERRORS, LEARN_S, QUIET_S, Trial, User, batches, error_process
+from validation.study import Report, Table, UsageError, in_processes, percent
 
 SEED: Final = 38021
 """Of the judging days; 38001 to 38020 are for practice."""
@@ -47,6 +49,7 @@ METHODS: Final = ("oracle", "zero")
 AT_ONCE: Final = 10
 """Runs side by side."""
 Method = Callable[[Run, Truth, Readings], Published]
+Factory = Callable[[User], Callable[[Readings], Published]]
 
 
 class Work(NamedTuple):
@@ -68,6 +71,19 @@ class Done(NamedTuple):
     found: dict[str, list[Found]]
     best: list[tuple[float, float]]
     cost_us: dict[str, float]
+    past: bool | None = None
+
+
+def made_of(name: str) -> Factory:
+    """Return the factory of MODULE:NAME. Raises UsageError."""
+    module, _, attribute = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UsageError(f"--method: {name}: {error}") from None
+    if not callable(found):
+        raise UsageError(f"--method: {name}: found no function")
+    return cast(Factory, found)
 
 
 def judged(work: Work) -> Done:
@@ -89,6 +105,16 @@ def judged(work: Work) -> Done:
         "zero": lambda run, truth, readings: zero(arm, readings, work.plant),
         BASELINE: lambda run, truth, readings: baseline.run(readings),
     }
+    judged_one = work.methods[0]
+    foreign: Callable[[Readings], Published] | None = None
+    if judged_one not in made:
+        values = arm.nominal
+        user = User(
+            URDF, arm.rated_nm, arm.ratio, values["torque_constant_nm_per_a"], values["rotor_kgm2"], told
+        )
+        foreign = estimate = made_of(judged_one)(user)
+        made[judged_one] = lambda run, truth, readings: estimate(readings)
+    past: bool | None = None
     found: dict[str, list[Found]] = {name: [] for name in work.methods}
     spent, cycles = dict.fromkeys(work.methods, 0.0), 0
     best = []
@@ -107,7 +133,10 @@ def judged(work: Work) -> Done:
                     published = made[name](run, truth, readings)
                     spent[name] += time.process_time() - begin
                     found[name].append(judge(arm, run, truth, readings, published))
-    return Done(work.plant, found, best, {name: 1e6 * spent[name] / max(cycles, 1) for name in work.methods})
+                    if foreign is not None and name == judged_one and past is None:
+                        past = of_the_past(foreign, readings, published)
+    cost_us = {name: 1e6 * spent[name] / max(cycles, 1) for name in work.methods}
+    return Done(work.plant, found, best, cost_us, past)
 
 
 def works(options: argparse.Namespace) -> list[Work]:
@@ -115,6 +144,8 @@ def works(options: argparse.Namespace) -> list[Work]:
     days, hours = (3, 0.06) if options.quick else (options.days, options.quiet_hours)
     arms = 1 if options.quick else options.arms
     quiet = math.ceil(3600.0 * hours / (QUIET_S - LEARN_S))
+    if options.method not in METHODS:
+        made_of(options.method)
     names = list(dict.fromkeys((options.method, BASELINE, *METHODS)))
     return [
         Work(
@@ -136,7 +167,11 @@ def options(parser: argparse.ArgumentParser) -> None:
         "--plant", action="append", choices=tuple(ERRORS), help="laws of the joints (default both)"
     )
     parser.add_argument(
-        "--method", choices=(*METHODS, BASELINE), default="oracle", help="judged (default %(default)s)"
+        "--method",
+        default="oracle",
+        metavar="NAME",
+        help="judged: oracle (default), zero, or MODULE:FUNCTION, which takes a `trial.User` and returns a function of a "
+        "day's `arm.Readings` to `judge.Published`",
     )
     parser.add_argument(
         "--joints",
@@ -161,7 +196,8 @@ def run(options: argparse.Namespace) -> Report:
         names = list(own[0].found)
         made = [figures([f for each in own for f in each.found[name]], plant) for name in names]
         cost = float(np.mean([each.cost_us[names[0]] for each in own]))
-        found = rows(plant, made, np.nan if names[0] in METHODS else cost)
+        pasts = [each.past for each in own if each.past is not None]
+        found = rows(plant, made, np.nan if names[0] in METHODS else cost, all(pasts) if pasts else None)
         reached = reached and all(row.reached is not False for row in found)
         notes.append(_noted(plant, [one for each in own for one in each.best]))
         tables += [

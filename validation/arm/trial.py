@@ -8,6 +8,7 @@ is drawn from the trial's seed.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import mujoco
@@ -22,6 +23,7 @@ from validation.arm.arm import (
     Array,
     Contact,
     Payload,
+    Readings,
     Run,
     Silence,
     Truth,
@@ -69,6 +71,20 @@ class Told(NamedTuple):
 
     run: Run
     payload: Payload
+
+
+class User(NamedTuple):
+    """What who uses the arm has: its URDF, data-sheet values [7], and the identification with payloads as told.
+
+    rotor_kgm2: at the joint.
+    """
+
+    urdf: Path
+    rated_nm: Array
+    gear_ratio: Array
+    torque_constant_nm_per_a: Array
+    rotor_kgm2: Array
+    identification: Sequence[tuple[Readings, Payload]]
 
 
 class Drawer:
