@@ -255,6 +255,11 @@ def test_a_wrench_is_judged_by_what_the_joints_allow() -> None:
     assert made.wrenches == 1.0
     out.wrench[at(12.5) :] = np.nan
     assert figures([found(out)], "typical").wrenches < 0.6
+    sigma = one.readings.sigma_nm[:1].copy()
+    sigma[0, 2] = np.nan
+    without, worse = wrench_information(jacobian, sigma)
+    assert np.isfinite(without).all()
+    assert worse[0] > condition[0]
     straight = np.array([0.0, 0.2, 0.0, -0.1, 0.0, 0.2, 0.0])
     assert wrench_information(tool_jacobians(straight[None]), one.readings.sigma_nm[:1])[1][0] > 20.0
 
@@ -357,13 +362,17 @@ def test_the_study_takes_an_estimator_by_name(
             path = np.repeat(POSE[None], round(seconds / CYCLE_S), axis=0)
             return Run(1000 + day, path, Payload())
 
+        def quiet(self, day: int, seconds: float = 1.0) -> Run:
+            return self.contact(day, seconds)._replace(silences=(Silence(4, 0.3, 0.6),))
+
     monkeypatch.setattr(study, "Trial", Short)
     name = "tests.validation.test_arm_judge:speechless"
-    done = study.judged(study.Work("typical", 38001, 0, [0], [], [name, "baseline", "zero"]))
+    done = study.judged(study.Work("typical", 38001, 0, [0], [1], [name, "baseline", "oracle"]))
     assert done.past is True
     assert done.found[name][0].published.sum() == 0
     assert done.cost_us[name] > 0.0
-    assert len(done.found["zero"]) == 1
+    assert [(each.told, each.silent) for each in done.found["oracle"]] == [(0, 0), (0, 300)]
+    assert done.found["baseline"][1].told == 300
     for wrong in ("nowhere.at:all", "tests.validation.test_arm_judge:nobody", "oracel"):
         assert command.main(["external_torque", "--method", wrong]) == 2
         assert len(capsys.readouterr().err.strip().splitlines()) == 1

@@ -238,8 +238,11 @@ def tool_jacobians(link_rad: Array) -> Array:
 
 
 def wrench_information(jacobian: Array, sigma_nm: Array) -> tuple[Array, Array]:
-    """Return by joints' sigmas [n, 7] the inverse covariance [n, 6, 6] of the tool's wrench, and its conditioning [n]."""
-    whitened = jacobian / sigma_nm[:, None, :]
+    """Return by joints' sigmas [n, 7] the inverse covariance [n, 6, 6] of the tool's wrench, and its conditioning [n].
+
+    A joint without a sigma tells nothing.
+    """
+    whitened = np.nan_to_num(jacobian / sigma_nm[:, None, :])
     information = whitened @ whitened.transpose(0, 2, 1)
     scaled = whitened * np.array([1.0, 1.0, 1.0, SCALE_M, SCALE_M, SCALE_M])[:, None]
     values = np.linalg.svd(scaled, compute_uv=False)
@@ -488,7 +491,7 @@ def oracle(arm: Arm, run: Run, truth: Truth, readings: Readings) -> Published:
     out = nothing(n)._replace(external_nm=external, sigma_nm=readings.sigma_nm.copy())
     jacobian = tool_jacobians(truth.link_rad)
     information, _ = wrench_information(jacobian, readings.sigma_nm)
-    weighted = (external / readings.sigma_nm**2)[:, :, None]
+    weighted = np.nan_to_num(external / readings.sigma_nm**2)[:, :, None]
     out.wrench[:] = np.linalg.solve(information + 1e-9 * np.eye(6), jacobian @ weighted)[:, :, 0]
     out.payload_kg[:], out.centre_m[:] = run.payload.mass_kg, run.payload.centre_m
     for contact in run.contacts:
