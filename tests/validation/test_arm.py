@@ -413,7 +413,9 @@ def test_a_payload_is_found_where_the_model_is_true() -> None:
 
         def joints(*_: Any, off: float = offset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             sigma = np.broadcast_to(0.0056 * arm.rated_nm, truth.drive_nm.shape)
-            return truth.drive_nm + off * sigma, sigma, np.ones(sigma.shape, np.int8)
+            torque = truth.drive_nm + off * sigma
+            torque[:5, 2] = torque[1000:1100, 4] = np.nan  # a jtqd starts, and has gaps
+            return torque, sigma, np.ones(sigma.shape, np.int8)
 
         found = best_payload(arm, truth, read(arm, run, truth, joints), "typical")
         assert found.mass_kg == pytest.approx(load.mass_kg, rel=close)

@@ -253,6 +253,9 @@ def test_a_wrench_is_judged_by_what_the_joints_allow() -> None:
     assert figures([found(out._replace(wrench=one.truth.wrench + 2.0 * drawn))], "typical").wrench > 1.8
     assert figures([found(out._replace(wrench=drawn))], "typical").wrench > 1.3
     assert made.wrenches == 1.0
+    unsure = one.readings.sigma_nm * np.array([1.0, 40.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    spread = judge(one.arm, one.run, one.truth, one.readings._replace(sigma_nm=unsure), out)
+    assert spread.poses == found(out).poses, "the pose is what it was"
     out.wrench[at(12.5) :] = np.nan
     assert figures([found(out)], "typical").wrenches < 0.6
     sigma = one.readings.sigma_nm[:1].copy()

@@ -183,9 +183,8 @@ def best_payload(arm: Arm, truth: Truth, readings: Readings, plant: str) -> Payl
     learned = round(LEARN_S / CYCLE_S)
 
     def fitted(x: Array, deriv: int = 0) -> Array:
-        return np.asarray(
-            savgol_filter(x[:learned], SMOOTHED, 3, deriv=deriv, delta=CYCLE_S, axis=0)[SMOOTHED::EVERY]
-        )
+        smooth = savgol_filter(x[:learned], SMOOTHED, 3, deriv, CYCLE_S, axis=0, mode="nearest")
+        return np.asarray(smooth[SMOOTHED:-SMOOTHED:EVERY])
 
     torque, sigma = fitted(readings.torque_nm), np.nanmean(readings.sigma_nm[:learned], axis=0)
     told = np.isfinite(torque).all(axis=1)

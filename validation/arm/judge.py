@@ -13,7 +13,19 @@ from typing import Final, NamedTuple
 import mujoco
 import numpy as np
 
-from validation.arm.arm import CYCLE_S, FALL_S, JOINTS, Arm, Array, Contact, Readings, Run, Truth, rigid
+from validation.arm.arm import (
+    CYCLE_S,
+    FALL_S,
+    JOINTS,
+    Arm,
+    Array,
+    Contact,
+    Readings,
+    Run,
+    Truth,
+    limits,
+    rigid,
+)
 from validation.arm.trial import LEARN_S, LEVER_M
 from validation.study import percent, wilson
 
@@ -29,7 +41,8 @@ LIGHTEST_KG: Final = 0.5
 SCALE_M: Final = 0.25
 """Torques of a wrench count as forces at this distance."""
 WELL: Final = 20.0
-"""A pose is well-conditioned where the tool's wrench is at most so many times less certain in one way than in another."""
+"""A pose is well-conditioned where the tool's wrench is at most so many times less certain in one way than in another,
+were all joints as sure as they are strong: what the pose itself allows."""
 EVERY: Final = 50
 """Cycles between the poses at which wrenches are judged."""
 BINS_N: Final = (5.0, 8.0, 12.0, 17.0, 25.0, 38.0, 60.0)
@@ -260,7 +273,9 @@ def _wrenches(
             judged |= (t > contact.full_s + LOOKED_S) & (t < contact.end_s)
     chosen = np.flatnonzero(judged)[::EVERY]
     sigma = readings.sigma_nm[chosen]
-    information, condition = wrench_information(tool_jacobians(truth.link_rad[chosen]), sigma)
+    jacobian = tool_jacobians(truth.link_rad[chosen])
+    information = wrench_information(jacobian, sigma)[0]
+    condition = wrench_information(jacobian, np.broadcast_to(limits()["rated_nm"], sigma.shape))[1]
     well = condition <= WELL
     error = (published.wrench - truth.wrench)[chosen][well]
     there = np.isfinite(error).all(axis=1)
