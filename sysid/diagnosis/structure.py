@@ -399,7 +399,7 @@ def _order_power(
             )
             wave *= (y - y.mean()) / len(y)
             for k in range(len(orders)):
-                power[k] += abs(np.sum(wave)) ** 2
+                power[k] += abs(wave.sum()) ** 2
                 wave *= turn
             weight += 1
     return power / max(weight, 1), weight
