@@ -54,9 +54,12 @@ class EdsChild:
         except subprocess.TimeoutExpired:
             self.stop()
             return
-        if self._process.returncode == 0:
-            for node, rows in json.loads(output).items():
-                _cache[int(node), self._files[int(node)]] = entries_from_json(rows)
+        try:
+            found = json.loads(output) if self._process.returncode == 0 else {}
+        except ValueError:  # a child that was stopped in its output has lost a part of it
+            return
+        for node, rows in found.items():
+            _cache[int(node), self._files[int(node)]] = entries_from_json(rows)
 
     def stop(self) -> None:
         """End the child without its result."""

@@ -229,6 +229,19 @@ def test_child_reads_the_same_entries_as_the_parser_here():
     assert {key: eds_entries._cache[key] for key in here} == here
 
 
+def test_entries_of_a_child_whose_output_is_cut_are_read_here():
+    from jtqd.sim_can import eds_entries
+
+    eds_entries._cache.clear()
+    child = eds_entries.EdsChild()
+    child.stop()
+    cut = [sys.executable, "-c", "print('{', end='')"]
+    child._process = subprocess.Popen(cut, stdout=subprocess.PIPE)
+    child.take()
+    assert eds_entries._cache == {}
+    assert eds_entries.entries_of(1, eds_entries.DRIVE)
+
+
 def test_bench_process_does_without_the_eds_parser(running):
     """Resident memory of the whole bench below 45 MB: canopen and python-can are not loaded."""
     _, process = running

@@ -45,7 +45,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def recorded(
-    directory: Path, seconds: float, beside: Callable[[subprocess.Popen[str]], None] | None = None
+    directory: Path, seconds: float, beside: Callable[[subprocess.Popen[str], Path], None] | None = None
 ) -> Path:
     """The log of a run; beside: what happens to its processes meanwhile, until they have ended."""
     content = shipped_bench()
@@ -67,7 +67,7 @@ def recorded(
         subprocess.Popen(command, env=env, stdout=out, stderr=subprocess.STDOUT, text=True) as process,
     ):
         if beside is not None:
-            beside(process)
+            beside(process, directory)
         process.wait(timeout=120)
     said = (directory / "out").read_text()
     assert process.returncode in (0, 3), said
@@ -76,9 +76,11 @@ def recorded(
     return found[0]
 
 
-def stopped_at_times(process: subprocess.Popen[str]) -> None:
-    """Stop one of the processes below this one after the other, for 2 to 150 ms, until it ends."""
+def stopped_at_times(process: subprocess.Popen[str], directory: Path) -> None:
+    """Once it records, stop one of the processes below this one after the other, for 2 to 150 ms, until it ends."""
     rng = np.random.default_rng(3)
+    while process.poll() is None and not list(directory.glob("logs/*")):
+        time.sleep(0.05)
     while process.poll() is None:
         below, every = [process.pid], list[int]()
         while below:
