@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
 from jtqd.sysid.diagnosis.entries import set_state
 from jtqd.sysid.diagnosis.findings import Present
+from jtqd.sysid.diagnosis.model import _Work
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, held_by_spring, joint_signals
 from jtqd.sysid.diagnosis.unexplained import remaining
@@ -209,3 +211,21 @@ def test_what_the_true_effects_leave_is_the_noise() -> None:
     s = dataset.signals[0][0]
     friction_nm = np.asarray(contribution(present[1].effect, present[1].values, s)["motor"])
     assert np.abs(friction_nm[s.usable("motor")]) == pytest.approx(2.0, rel=1e-2)
+
+
+def test_the_zero_of_a_run_is_worth_what_the_losses_of_the_set_make_of_it() -> None:
+    usable, _ = usable_signals([("a", rigid_run(PLAIN)), ("b", rigid_run(PLAIN, 0.3))], {1: PLAIN}, (1,))
+    dataset = build_dataset(usable, {1: PLAIN})
+    work = _Work(dataset)
+    k = next(k for k, e in enumerate(work.entries) if e.effect.name == "load_dependent_friction")
+    zero = next(k for k, family in enumerate(dataset.families) if family.name == "zero")
+
+    def column() -> FloatArray:
+        d = work.runs[0].channels[MOTOR1]
+        return np.asarray(d.nuisances[d.valid, int(np.flatnonzero(d.families == zero)[0])])
+
+    assert column() == pytest.approx(-1.0)
+    scaled = np.array([2.5])
+    mu = work.entries[k].values(scaled)["load_coefficient"]
+    work.move(frozenset({k}), scaled, frozenset({"loss_per_torque"}), None)
+    assert set(np.round(np.abs(column()), 3)) >= {round(1.0 - mu, 3), round(1.0 + mu, 3)}
