@@ -33,7 +33,7 @@ from validation.arm.judge import (
     wrench_information,
     zero,
 )
-from validation.arm.trial import FALL_S, LEARN_S, Told, Trial, User, error_process
+from validation.arm.trial import FALL_S, LEARN_S, Trial, User, Weighed, error_process
 
 POSE = np.array([0.3, -0.3, 0.0, -2.2, 0.0, 2.0, 0.4])
 LOAD = Payload(2.0, (0.01, -0.02, 0.05))
@@ -138,11 +138,11 @@ def test_errors_are_of_rated_and_without_contact() -> None:
     free = free_cycles(one.run, len(out.contact)).sum()
     assert figures([found(out)], "typical").published == pytest.approx(1.0 - 1000 / free)
     out.external_nm[at(12.5) : at(13.5), 3] = 0.03 * one.arm.rated_nm[3]
-    for quiet, told in ((False, 2000), (True, 0)):
+    for quiet, claimed in ((False, 2000), (True, 0)):
         run = one.run._replace(silences=(Silence(3, 12.0, 14.0),))
         out.external_nm[at(12.0) : at(14.0), 3] = np.nan if quiet else 1e6
         made = figures([judge(one.arm, run, one.truth, one.readings, out)], "typical")
-        assert made.told == (told, 2000)
+        assert made.claimed == (claimed, 2000)
         assert made.published == 1.0
         assert made.rms == pytest.approx(np.full(JOINTS, 0.03))
         row = "a joint without torque: cycles with its external torque"
@@ -358,7 +358,7 @@ def test_the_study_takes_an_estimator_by_name(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     class Short(Trial):
-        def identification(self, runs: int = 2, seconds: float = 2.0) -> list[Told]:
+        def identification(self, runs: int = 2, seconds: float = 2.0) -> list[Weighed]:
             return super().identification(runs, seconds)
 
         def contact(self, day: int, seconds: float = 1.0) -> Run:
@@ -374,8 +374,8 @@ def test_the_study_takes_an_estimator_by_name(
     assert done.past is True
     assert done.found[name][0].published.sum() == 0
     assert done.cost_us[name] > 0.0
-    assert [(each.told, each.silent) for each in done.found["oracle"]] == [(0, 0), (0, 300)]
-    assert done.found["baseline"][1].told == 300
+    assert [(each.claimed, each.silent) for each in done.found["oracle"]] == [(0, 0), (0, 300)]
+    assert done.found["baseline"][1].claimed == 300
     for wrong in ("nowhere.at:all", "tests.validation.test_arm_judge:nobody", "oracel"):
         assert command.main(["external_torque", "--method", wrong]) == 2
         assert len(capsys.readouterr().err.strip().splitlines()) == 1

@@ -34,7 +34,7 @@ URDF: Final = Path(__file__).with_name("panda.urdf")
 PLANTS: Final = Path(__file__).parents[2] / "models" / "plants"
 JOINTS: Final = 7
 TOOL: Final = "panda_hand_tcp"
-"""Frame of the URDF at which wrench and payload are told."""
+"""Frame of the URDF at which wrench and payload are reported."""
 CYCLE_S: Final = 1e-3
 SUBSTEPS: Final = 4
 STEP_S: Final = CYCLE_S / SUBSTEPS

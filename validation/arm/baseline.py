@@ -74,21 +74,25 @@ class Dynamics:
 
 
 class Baseline:
-    """Fitted to the identification: readings, and the payload as told. Attribute `friction` [3, 7]: Fc, Fv, Fo."""
+    """Fitted to the identification: readings, and the payload as weighed. Attribute `friction` [3, 7]: Fc, Fv, Fo."""
 
-    def __init__(self, arm: Arm, told: Sequence[tuple[Readings, Payload]]) -> None:
+    def __init__(self, arm: Arm, identification: Sequence[tuple[Readings, Payload]]) -> None:
         self.ratio, self.rated = arm.ratio, arm.rated_nm
         self.per_amp = arm.ratio * arm.nominal["torque_constant_nm_per_a"]
         self.rotor = arm.nominal["rotor_kgm2"]
         self.empty = Dynamics(rigid())
-        sides = [self._sides(readings, Dynamics(rigid(payload=payload))) for readings, payload in told]
+        sides = [
+            self._sides(readings, Dynamics(rigid(payload=payload))) for readings, payload in identification
+        ]
         speed, torque = (np.concatenate(each) for each in zip(*sides, strict=True))
         self.friction = np.zeros((3, JOINTS))
         for j in range(JOINTS):
             moving = np.abs(speed[:, j]) > SLOW_RAD_S
             columns = self._columns(speed[moving, j])
             self.friction[:, j] = np.linalg.lstsq(columns, torque[moving, j], rcond=None)[0]
-        residuals = [self._residual(readings, Dynamics(rigid(payload=payload))) for readings, payload in told]
+        residuals = [
+            self._residual(readings, Dynamics(rigid(payload=payload))) for readings, payload in identification
+        ]
         every = np.concatenate([r[1000:] for r in residuals])
         self.sigma = np.sqrt(np.mean(every * every, axis=0))
         self.threshold = MARGIN * np.abs(every).max(axis=0)
@@ -187,9 +191,9 @@ def best_payload(arm: Arm, truth: Truth, readings: Readings, plant: str) -> Payl
         return np.asarray(smooth[SMOOTHED:-SMOOTHED:EVERY])
 
     torque, sigma = fitted(readings.torque_nm), np.nanmean(readings.sigma_nm[:learned], axis=0)
-    told = np.isfinite(torque).all(axis=1)
+    known = np.isfinite(torque).all(axis=1)
     q, v, a = fitted(truth.link_rad), fitted(truth.link_rad_s), fitted(truth.link_rad_s, 1)
     parts = ERRORS[plant][1]
     return fit_payload(
-        arm.model, (q[told], v[told], a[told]), torque[told], sigma, float(np.sqrt(parts[0] + parts[2]))
+        arm.model, (q[known], v[known], a[known]), torque[known], sigma, float(np.sqrt(parts[0] + parts[2]))
     )

@@ -152,9 +152,9 @@ class RealJoints:
         torque, sigma = (
             np.stack([getattr(each, key) for each in found], axis=1) for key in ("torque_nm", "sigma_nm")
         )
-        told = np.stack([each.status for each in found], axis=1)
-        status = np.full(told.shape, VALID, np.int8)
+        reported = np.stack([each.status for each in found], axis=1)
+        status = np.full(reported.shape, VALID, np.int8)
         for of, to in ((JTQD_DEGRADED, DEGRADED), (JTQD_STANDSTILL, STANDSTILL)):
-            status[told == of] = to
+            status[reported == of] = to
         status[~np.isfinite(torque)] = NO_TORQUE
         return torque, sigma, status

@@ -1,7 +1,7 @@
 """The judge of external torque: figures of what an estimator published over days of the foreign arm, beside their limits.
 
 An estimator is judged by the truth of the plant alone. Figures count after LEARN_S of a day; `free` is all time but contacts
-and SETTLED_S after each. What was not published where it could be is told in figures of its own.
+and SETTLED_S after each. What was not published where it could be has figures of its own.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def of_the_past(run: Callable[[Readings], Published], readings: Readings, publis
 
 
 class Event(NamedTuple):
-    """One contact: reported after its full force by delay_s, infinite for never. told: 0, or the link that was named."""
+    """One contact: reported after its full force by delay_s, infinite for never. named: 0, or the link that was named."""
 
     kind: str
     link: int
@@ -119,7 +119,7 @@ class Event(NamedTuple):
     lever_m: float
     own_share: float
     delay_s: float
-    told: int
+    named: int
     point_off_m: float
     strength_off: float
     since_off_s: float
@@ -127,7 +127,7 @@ class Event(NamedTuple):
 
 class Found(NamedTuple):
     """Of one run: counts and sums over free cycles [7], mean square under full force [7], contacts, false alarms, payload,
-    wrenches; told, silent: cycles of joints without a torque that have an external torque all the same, and all of them.
+    wrenches; claimed, silent: cycles of joints without a torque that have an external torque all the same, and all of them.
 
     Errors of a payload: infinite where none is published, NaN where none is judged.
     """
@@ -145,7 +145,7 @@ class Found(NamedTuple):
     wrench_square: float
     wrenches: int
     poses: int
-    told: int
+    claimed: int
     silent: int
 
 
@@ -217,10 +217,10 @@ def _event(arm: Arm, contact: Contact, truth: Truth, published: Published, began
     delay = (reported[0] - full) * CYCLE_S if len(reported) else np.inf
     force = float(np.linalg.norm(contact.force_n))
     felt = np.abs(truth.external_nm[look])
-    told = int(published.contact[look])
+    named = int(published.contact[look])
     point = (
         np.linalg.norm(published.point_m[look] - np.array(contact.point_m))
-        if told == contact.link
+        if named == contact.link
         else np.nan
     )
     return Event(
@@ -230,10 +230,10 @@ def _event(arm: Arm, contact: Contact, truth: Truth, published: Published, began
         float(felt.max()) / force,
         float(felt[contact.link - 1] / arm.rated_nm[contact.link - 1]),
         float(delay),
-        told,
+        named,
         float(point),
-        float(abs(published.strength_n[look] / force - 1.0)) if told else np.nan,
-        float(abs(published.since_s[look] - contact.start_s)) if told else np.nan,
+        float(abs(published.strength_n[look] / force - 1.0)) if named else np.nan,
+        float(abs(published.since_s[look] - contact.start_s)) if named else np.nan,
     )
 
 
@@ -299,7 +299,7 @@ class Figures(NamedTuple):
     pushed: Array
     inside: Array
     published: float
-    told: tuple[int, int]
+    claimed: tuple[int, int]
     mass: tuple[float, float]
     centre_m: tuple[float, float]
     detected: dict[str, tuple[int, int]]
@@ -322,8 +322,8 @@ def figures(found: Sequence[Found], plant: str) -> Figures:
         for key in ("cycles", "published", "square", "inside")
     )
     events = [event for each in found for event in each.events]
-    told = [e for e in events if e.told and e.own_share >= TELLS * RMS[plant]]
-    points = [e.point_off_m for e in told if e.link >= POINT_FROM and e.told == e.link]
+    named = [e for e in events if e.named and e.own_share >= TELLS * RMS[plant]]
+    points = [e.point_off_m for e in named if e.link >= POINT_FROM and e.named == e.link]
     squares, wrenches, poses = (
         sum(getattr(each, key) for each in found) for key in ("wrench_square", "wrenches", "poses")
     )
@@ -334,17 +334,17 @@ def figures(found: Sequence[Found], plant: str) -> Figures:
         np.sqrt(np.mean(pushed, axis=0)) if pushed else np.full(JOINTS, np.nan),
         inside / np.maximum(published, 1),
         float((published / np.maximum(cycles, 1)).min()),
-        (sum(each.told for each in found), sum(each.silent for each in found)),
+        (sum(each.claimed for each in found), sum(each.silent for each in found)),
         _within_of([each.mass_off for each in heavy]),
         _within_of([each.centre_off_m for each in heavy]),
         {kind: _within(events, kind, limit) for kind, limit in WITHIN_S.items()},
         {kind: _median([e.delay_s for e in events if _counts(e, kind)]) for kind in WITHIN_S},
         sum(each.alarms for each in found),
         sum(each.free_s for each in found) / 3600.0,
-        (sum(e.told == e.link for e in told), len(told)),
+        (sum(e.named == e.link for e in named), len(named)),
         _median(points),
-        _median([e.strength_off for e in events if e.told]),
-        _median([e.since_off_s for e in events if e.told]),
+        _median([e.strength_off for e in events if e.named]),
+        _median([e.since_off_s for e in events if e.named]),
         float(np.sqrt(squares / wrenches)) if wrenches else np.inf,
         wrenches / max(poses, 1),
         [
@@ -411,8 +411,8 @@ def rows(plant: str, made: Sequence[Figures], cost_us: float = np.nan, past: boo
         Row(
             "a joint without torque: cycles with its external torque",
             "none",
-            [percent(f.told[0] / f.told[1]) if f.told[1] else "none" for f in made],
-            one.told[0] == 0,
+            [percent(f.claimed[0] / f.claimed[1]) if f.claimed[1] else "none" for f in made],
+            one.claimed[0] == 0,
         ),
         Row(
             "payload, mass: half of the days; nine of ten",

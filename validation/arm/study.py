@@ -1,7 +1,7 @@
 """External torque of a foreign arm: an estimator and the momentum observer on motor current, judged on held-out days.
 
 Arms are drawn, identified from free motion with two payloads, and judged on days with pushes and clamps and on quiet days.
-The judged method decides the exit status. `oracle` has the true model and is told payload and contact: what joints as wrong
+The judged method decides the exit status. `oracle` has the true model and knows payload and contact: what joints as wrong
 as these allow. `zero` says that nothing ever pushes. With `--joints fitted` each joint is fitted on a towing bench and
 publishes what the product's estimator makes of its readings; else it is as wrong as `trial.ERRORS` says.
 
@@ -95,11 +95,11 @@ def judged(work: Work) -> Done:
         from validation.arm.joints import RealJoints, towed
 
         joints = RealJoints(arm, *towed(arm))
-    told = []
+    identification = []
     for part in batches(trial.identification(), AT_ONCE):
         for each, truth in zip(part, arm.record([one.run for one in part]), strict=True):
-            told.append((read(arm, each.run, truth, joints), each.payload))
-    baseline = Baseline(arm, told)
+            identification.append((read(arm, each.run, truth, joints), each.payload))
+    baseline = Baseline(arm, identification)
     made: dict[str, Method] = {
         "oracle": lambda run, truth, readings: oracle(arm, run, truth, readings),
         "zero": lambda run, truth, readings: zero(arm, readings, work.plant),
@@ -110,7 +110,12 @@ def judged(work: Work) -> Done:
     if judged_one not in made:
         values = arm.nominal
         user = User(
-            URDF, arm.rated_nm, arm.ratio, values["torque_constant_nm_per_a"], values["rotor_kgm2"], told
+            URDF,
+            arm.rated_nm,
+            arm.ratio,
+            values["torque_constant_nm_per_a"],
+            values["rotor_kgm2"],
+            identification,
         )
         foreign = estimate = made_of(judged_one)(user)
         made[judged_one] = lambda run, truth, readings: estimate(readings)

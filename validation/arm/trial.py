@@ -1,7 +1,7 @@
 """What the foreign arm does: drawn motions within limits, days, payloads, pushes and clamps, and what its joints publish.
 
-Three sets per arm, each run on a day of its own: identification (free motion, two payloads that are told), contact (pushes
-and clamps after LEARN_S of free motion with a payload that is not told), quiet (the same without any contact). Everything
+Three sets per arm, each run on a day of its own: identification (free motion, two weighed payloads), contact (pushes
+and clamps after LEARN_S of free motion with a payload that nobody knows), quiet (the same without any contact). Everything
 is drawn from the trial's seed.
 """
 
@@ -39,8 +39,8 @@ QUIET_S: Final = 120.0
 SILENCE_S: Final = 3.0
 KNOWN: Final = Payload(2.0, (0.01, -0.02, 0.06))
 """Second payload of the identification; the first one is nothing."""
-TOLD_KG, TOLD_M = 0.010, 0.001
-"""Half widths by which the told mass and centre are wrong."""
+WEIGHED_KG, WEIGHED_M = 0.010, 0.001
+"""Half widths by which the weighed mass and centre are wrong."""
 HEAVIEST_KG: Final = 3.0
 RANGE_SHARE, SPEED_SHARE, TORQUE_SHARE = 0.8, 0.6, 0.65
 """Motions stay within these shares of the URDF's limits, torques with the heaviest payload."""
@@ -66,7 +66,7 @@ motor's turn, over the link's turn, slow, the rest (`python -m validation source
 SLOW_S, REST_S = 0.5, 0.01
 
 
-class Told(NamedTuple):
+class Weighed(NamedTuple):
     """A run of the identification with the payload that the user believes."""
 
     run: Run
@@ -74,7 +74,7 @@ class Told(NamedTuple):
 
 
 class User(NamedTuple):
-    """What who uses the arm has: its URDF, data-sheet values [7], and the identification with payloads as told.
+    """What who uses the arm has: its URDF, data-sheet values [7], and the identification with payloads as weighed.
 
     rotor_kgm2: at the joint.
     """
@@ -258,14 +258,18 @@ class Trial:
     def _rng(self, *numbers: int) -> np.random.Generator:
         return np.random.default_rng([*self.key, 41, *numbers])
 
-    def identification(self, runs: int = IDENTIFY_RUNS, seconds: float = IDENTIFY_S) -> list[Told]:
-        """Return free motion, every other run with KNOWN at the tool, which is told with an error."""
+    def identification(self, runs: int = IDENTIFY_RUNS, seconds: float = IDENTIFY_S) -> list[Weighed]:
+        """Return free motion, every other run with KNOWN at the tool, which was weighed with an error."""
         off = self._rng(0).uniform(-1.0, 1.0, 4)
-        told = Payload(KNOWN.mass_kg + TOLD_KG * off[0], _three(np.array(KNOWN.centre_m) + TOLD_M * off[1:]))
+        weighed = Payload(
+            KNOWN.mass_kg + WEIGHED_KG * off[0], _three(np.array(KNOWN.centre_m) + WEIGHED_M * off[1:])
+        )
         found = []
         for k in range(runs):
             path = Drawer(self._rng(1, k)).motion(seconds)
-            found.append(Told(Run(k, path, KNOWN if k % 2 else Payload()), told if k % 2 else Payload()))
+            found.append(
+                Weighed(Run(k, path, KNOWN if k % 2 else Payload()), weighed if k % 2 else Payload())
+            )
         return found
 
     def contact(self, day: int, seconds: float = CONTACT_S) -> Run:
