@@ -251,7 +251,10 @@ def test_a_wrench_is_judged_by_what_the_joints_allow() -> None:
     assert condition[0] < 20.0
     assert made.wrench == pytest.approx(1.0, abs=0.1)
     assert figures([found(out._replace(wrench=one.truth.wrench + 2.0 * drawn))], "typical").wrench > 1.8
-    assert figures([found(out._replace(wrench=drawn))], "typical").wrench > 1.3
+    none = found(out._replace(wrench=drawn))
+    assert figures([none], "typical").wrench > 1.3
+    longer = none._replace(wrench_square=none.wrench_square * (100, 1), wrenches=none.wrenches * (100, 1))
+    assert figures([longer], "typical").wrench == figures([none], "typical").wrench, "free time hides nothing"
     assert made.wrenches == 1.0
     unsure = one.readings.sigma_nm * np.array([1.0, 40.0, 1.0, 1.0, 1.0, 1.0, 1.0])
     spread = judge(one.arm, one.run, one.truth, one.readings._replace(sigma_nm=unsure), out)

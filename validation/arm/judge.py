@@ -128,6 +128,7 @@ class Event(NamedTuple):
 class Found(NamedTuple):
     """Of one run: counts and sums over free cycles [7], mean square under full force [7], contacts, false alarms, payload,
     wrenches; claimed, silent: cycles of joints without a torque that have an external torque all the same, and all of them.
+    Wrenches [2]: free, and while the tool is pushed.
 
     Errors of a payload: infinite where none is published, NaN where none is judged.
     """
@@ -142,8 +143,8 @@ class Found(NamedTuple):
     free_s: float
     mass_off: float
     centre_off_m: float
-    wrench_square: float
-    wrenches: int
+    wrench_square: Array
+    wrenches: Array
     poses: int
     claimed: int
     silent: int
@@ -264,14 +265,14 @@ def wrench_information(jacobian: Array, sigma_nm: Array) -> tuple[Array, Array]:
 
 def _wrenches(
     run: Run, truth: Truth, readings: Readings, published: Published, free: Array
-) -> tuple[float, int, int]:
-    """Return the sum of e' W^-1 e / 6, their number, that of well-conditioned poses; free, and while the tool is pushed."""
+) -> tuple[Array, Array, int]:
+    """Return the sum of e' W^-1 e / 6 and their number, free and while the tool is pushed [2]; well-conditioned poses."""
     n = len(free)
-    t, judged = CYCLE_S * np.arange(n), free.copy()
+    t, pushed = CYCLE_S * np.arange(n), np.zeros(len(free), bool)
     for contact in run.contacts:
         if contact.link == JOINTS:
-            judged |= (t > contact.full_s + LOOKED_S) & (t < contact.end_s)
-    chosen = np.flatnonzero(judged)[::EVERY]
+            pushed |= (t > contact.full_s + LOOKED_S) & (t < contact.end_s)
+    chosen = np.flatnonzero(free | pushed)[::EVERY]
     sigma = readings.sigma_nm[chosen]
     jacobian = tool_jacobians(truth.link_rad[chosen])
     information = wrench_information(jacobian, sigma)[0]
@@ -280,7 +281,8 @@ def _wrenches(
     error = (published.wrench - truth.wrench)[chosen][well]
     there = np.isfinite(error).all(axis=1)
     squares = np.einsum("ni,nij,nj->n", error[there], information[well][there], error[there]) / 6.0
-    return float(squares.sum()), int(there.sum()), int(well.sum())
+    during = pushed[chosen][well][there].astype(np.intp)
+    return np.bincount(during, squares, 2), np.bincount(during, minlength=2), int(well.sum())
 
 
 class Row(NamedTuple):
@@ -324,9 +326,10 @@ def figures(found: Sequence[Found], plant: str) -> Figures:
     events = [event for each in found for event in each.events]
     named = [e for e in events if e.named and e.own_share >= TELLS * RMS[plant]]
     points = [e.point_off_m for e in named if e.link >= POINT_FROM and e.named == e.link]
-    squares, wrenches, poses = (
-        sum(getattr(each, key) for each in found) for key in ("wrench_square", "wrenches", "poses")
+    squares, wrenches = (
+        np.sum([getattr(each, key) for each in found], axis=0) for key in ("wrench_square", "wrenches")
     )
+    poses = sum(each.poses for each in found)
     pushed = [each.pushed for each in found if not np.isnan(each.pushed).any()]
     heavy = [each for each in found if not np.isnan(each.mass_off)]
     return Figures(
@@ -345,8 +348,9 @@ def figures(found: Sequence[Found], plant: str) -> Figures:
         _median(points),
         _median([e.strength_off for e in events if e.named]),
         _median([e.since_off_s for e in events if e.named]),
-        float(np.sqrt(squares / wrenches)) if wrenches else np.inf,
-        wrenches / max(poses, 1),
+        # the worse of both: most of the time nothing pushes, and an estimate of nothing is right
+        float(np.sqrt(squares[wrenches > 0] / wrenches[wrenches > 0]).max()) if wrenches.any() else np.inf,
+        float(np.sum(wrenches)) / max(poses, 1),
         [
             _share(
                 [
