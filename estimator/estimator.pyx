@@ -21,7 +21,7 @@ from jtqd.estimator.observer cimport (
     observe_fused, restart_guard
 )
 from jtqd.estimator.fusion cimport (
-    Fused, Learned, Rest, TURN_WAVES, apart_nm2, at_rest, degrades, drop_block, early_factor, fading,
+    Fused, Learned, Rest, TURN_WAVES, apart_nm2, at_rest, day_nm2, degrades, drop_block, fading,
     fill_agreement, fill_fusion, fill_offsets, fill_proof, fuse_paths, gather, go_back, implausible, keep_offsets, known_nm2,
     local_stiffness, mismatch_variance, offsets_of, pause_turn, possible_error, prove, report_offsets, restart_agreement,
     restart_offsets, restart_proof, restart_turn, reweigh, turn_differs, unproven_nm2, update_difference, update_turn
@@ -503,7 +503,7 @@ cdef class FusedEstimator(Estimator):
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
-        cdef double scale, view, trusted = 1.0, difference, known = 0.0, early = 1.0, share = 1.0
+        cdef double scale, view, trusted = 1.0, difference, known = 0.0, share = 1.0
         cdef double spread, more, mismatch, variance, unproven, lost, noise, stiffness
         cdef FusedObserved at
         cdef int status
@@ -546,9 +546,8 @@ cdef class FusedEstimator(Estimator):
             self.update_path_difference(&at, x, &best, loss.nm, status)
         if law.offsets.spread > 0.0:
             known = known_nm2(&law.offsets, &s.offsets)
-            reweigh(&physics, known)
-            reweigh(&best, known)
-            early = early_factor(&law.offsets, known)
+            reweigh(&physics, known, law.offsets.spread_nm)
+            reweigh(&best, known, law.offsets.spread_nm)
         out.physics_nm = physics.value + seen.ahead_nm  # paths fused at the same delay, then advanced by the torsion
         out.torque_nm = best.value + at.ahead_nm
         # at rest the current path is only an interval, and its distance to the torsion is no evidence against the file
@@ -561,10 +560,10 @@ cdef class FusedEstimator(Estimator):
             degraded = True
         if by_network and not standing:
             share = best.alpha * best.alpha
-        spread = scale * best.sigma * early
+        spread = scale * best.sigma
         # an uncorrected offset counts once: as mismatch, where the file has section agreement
         more = apart_nm2(&best, 0.0 if law.agreement.used else s.offsets.uncorrected_nm)
-        variance = spread * spread + more
+        variance = spread * spread + day_nm2(&law.offsets, known, best.alpha) + more
         if law.agreement.used:
             mismatch = mismatch_variance(&s.agreement, best.alpha, at.torsion_nm)
             if degrades(

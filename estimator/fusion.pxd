@@ -18,7 +18,7 @@ cdef double fading(double half, double before, double dt) noexcept nogil
 cdef Fused fuse_paths(
     const FusionLaw *law, double raw, double loss, double half, double velocity, double torsion, double open_nm
 ) noexcept nogil
-cdef void reweigh(Fused *fused, double known) noexcept nogil
+cdef void reweigh(Fused *fused, double known, double day) noexcept nogil
 
 cdef struct Rest:
     double spread, bound
@@ -66,7 +66,6 @@ cdef struct OffsetLaw:
     double known  # variance of the link offset [rad^2] below which it counts as learned
     double correlation  # [s]: of the noise on the days of the fit
     double spread, spread_nm  # variance of the link offset over the days [rad^2, Nm^2]; 0: not known
-    double early  # [1/Nm^2]: increase of the estimate's spread per Nm^2 of unknown offset
 
 cdef struct Block:  # sums over the samples of a block
     double dt, y, direction, velocity, torsion, variance
@@ -96,7 +95,7 @@ cdef bint gather(
 ) noexcept nogil
 cdef double local_stiffness(const FusedObserverLaw *law, double deflection) noexcept nogil
 cdef double known_nm2(const OffsetLaw *law, const OffsetState *s) noexcept nogil
-cdef double early_factor(const OffsetLaw *law, double known) noexcept nogil
+cdef double day_nm2(const OffsetLaw *law, double known, double alpha) noexcept nogil
 cdef bint implausible(const OffsetLaw *law, const OffsetState *s) noexcept nogil
 cdef void report_offsets(const OffsetLaw *law, const OffsetState *s, Learned *out) noexcept nogil
 cdef offsets_of(const OffsetLaw *law, const OffsetState *s)

@@ -61,10 +61,13 @@ correction follows with time constant SLEW_S, because the estimate must not jump
 
 Where the joint file has the spread of the offset from day to day (`fused.zeros`: S, as a torque S_nm), the part
 k = S^2/(S^2 + sigma_d^2) of x_d is corrected in any case (Wiener), in addition w - k of x where that is positive, and the
-variance of the torsion in the fusion is s_t^2 - k S_nm^2. The spread of the fused value is wider by
-1 + (early - 1) (1 - known/S_nm^2), known: the reduction of s_t^2. X_d and sigma_d are those of a second filter with the noise
-on the days of the fit (`correlation_s`). The first filter has noise that includes the day's friction, so that it learns more
-slowly; it judges what exceeds ordinary days, and the agreement of the paths.
+variance of the torsion in the fusion is s_t^2 - known, known = k S_nm^2. The day's part of sigma^2 has no scale, and no less
+weight where the paths agree: they may share an error of the day. The spread is that of the rest:
+
+    day^2 = min(S_nm^2 - known, alpha S_nm^2),   spread^2 = alpha (s_t^2 - S_nm^2)
+
+X_d and sigma_d are those of a second filter with the noise on the days of the fit (`correlation_s`). The first filter has noise that
+includes the day's friction, so that it learns more slowly; it judges what exceeds ordinary days, and the agreement of the paths.
 
 **Nothing is learned from a fault.** The estimate of the offsets, states and covariance, is kept once the paths have agreed by it for
 CALM_S of motion. What was learned since goes back to it where that is contradicted: an encoder is out of order (then, and a second
@@ -189,13 +192,12 @@ cdef Fused fuse_paths(
     return Fused(alpha, value + alpha * (torsion - value), sqrt(alpha * t + law.reference), torsion - value, c + t, half)
 
 
-cdef void reweigh(Fused *fused, double known) noexcept nogil:
-    """Weigh with a torsion whose variance is less by `known` [Nm^2]; `variance` stays that of the file. For a reference of 0."""
-    cdef double c = fused.alpha * fused.variance, t = fused.variance - c, alpha
-    t = fmax(t - known, LEAST_VARIANCE * t)
-    alpha = c / (c + t)
+cdef void reweigh(Fused *fused, double known, double day) noexcept nogil:
+    """Weigh with a torsion whose variance is less by `known` [Nm^2]; `variance` stays, `sigma` is without `day` [Nm^2] of it."""
+    cdef double c = fused.alpha * fused.variance, t = fused.variance - c, least = LEAST_VARIANCE * t, alpha
+    alpha = c / (c + fmax(t - known, least))
     fused.value += (alpha - fused.alpha) * fused.difference
-    fused.alpha, fused.sigma = alpha, sqrt(alpha * t)
+    fused.alpha, fused.sigma = alpha, sqrt(alpha * fmax(t - day, least))
 
 
 cdef Rest at_rest(
@@ -319,7 +321,7 @@ cdef class Fusion:
         for k in range(x.shape[1]):
             fused = fuse_paths(&self.law, x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
             if known:
-                reweigh(&fused, x[6, k])
+                reweigh(&fused, x[6, k], x[6, k])
                 fused.sigma = sqrt(fused.sigma * fused.sigma + self.law.reference)
             to[0, k], to[1, k], to[2, k], to[3, k] = fused.alpha, fused.value, fused.sigma, fused.variance
         return FusedPaths(*out)
@@ -400,7 +402,6 @@ cdef int fill_offsets(
     if law.corrected and fused.zeros is not None:
         law.correlation = fused.zeros.correlation_s or CORRELATION_S
         law.spread, law.spread_nm = fused.zeros.spread_rad**2, fused.zeros.spread_nm**2
-        law.early = (fused.zeros.early - 1.0) / law.spread_nm
     law.prior[0] = (LARGEST_LINK * rated_nm / law.stiffness) ** 2
     law.prior[1] = (CURRENT_SHARE * sigma.current_nm / law.torque_per_ampere) ** 2
     law.prior[2] = sigma.current_nm**2 + (FRICTION_SHARE * constant) ** 2
@@ -598,9 +599,9 @@ cdef double known_nm2(const OffsetLaw *law, const OffsetState *s) noexcept nogil
     return fmax(0.0, share * law.spread_nm - late * late)
 
 
-cdef double early_factor(const OffsetLaw *law, double known) noexcept nogil:
-    """Return the factor on the spread of the estimate, 1 to `early`; known: of `known_nm2` [Nm^2]."""
-    return 1.0 + law.early * (law.spread_nm - known)
+cdef double day_nm2(const OffsetLaw *law, double known, double alpha) noexcept nogil:
+    """Return what the day's offset is in sigma^2 [Nm^2]; known: of `known_nm2`; alpha: share of the torsion."""
+    return fmin(law.spread_nm - known, alpha * law.spread_nm)
 
 
 cdef double _uncorrected_torque(const OffsetLaw *law, const OffsetState *s) noexcept nogil:
@@ -944,8 +945,8 @@ def track_run(
     """Return (alpha, torsion, current, spread, more, known) of a run from its start, as the estimator has them at each sample.
 
     alpha: share of the torsion; torsion, current: corrections of both paths [Nm]; spread: standard deviation of the value [Nm],
-    scale 1, with `early`; more: what widens it [Nm^2]; known: reduction of s_t^2 [Nm^2]. Arrays [n] of all samples, `fused` with
-    a torsion. difference_nm: torsion less current path; slope: dL/draw of the loss; stiffness: d tau_t/d d of the spring
+    scale 1; more: what widens it [Nm^2]; known: reduction of s_t^2 [Nm^2]. Arrays [n] of all samples, `fused` with a
+    torsion. difference_nm: torsion less current path; slope: dL/draw of the loss; stiffness: d tau_t/d d of the spring
     [Nm/rad]; ahead: change of the torsion since the current path [Nm]; behind: what the tracking filter leaves of two readings
     [Nm^2]; resting: standing samples. tracked: offsets are corrected.
     """
@@ -989,9 +990,9 @@ def track_run(
             update_difference(&law, &s, &levels_law, &agreement, x[k, 9], x[k, 8])
         known = known_nm2(&law, &s)
         if law.spread > 0.0:
-            reweigh(&physics, known)
-        to[0, k], to[3, k], to[5, k] = physics.alpha, physics.sigma * early_factor(&law, known), known
-        to[4, k] = apart_nm2(&physics, 0.0 if levels_law.used else s.uncorrected_nm)
+            reweigh(&physics, known, law.spread_nm)
+        to[0, k], to[3, k], to[5, k] = physics.alpha, physics.sigma, known
+        to[4, k] = apart_nm2(&physics, 0.0 if levels_law.used else s.uncorrected_nm) + day_nm2(&law, known, physics.alpha)
         to[4, k] += unproven_nm2(&proof_law, unproven, physics.alpha, s.now.link_rad, x[k, 11])
         if levels_law.used:
             to[4, k] += mismatch_variance(&agreement, physics.alpha, torsion)

@@ -311,15 +311,15 @@ class DayZeros:
 
     spread_rad: standard deviation over the days of the fit; spread_nm: its part of sigma.torsion_nm, which what is learned
     takes away again; scale: in place of sigma.scale where zeros are tracked; correlation_s: so long the
-    difference of the two paths keeps what is no state of the day, None: `fusion.CORRELATION_S`; early: factor of the spread
-    where nothing is known of the day's zero.
+    difference of the two paths keeps what is no state of the day, None: `fusion.CORRELATION_S`; early: of files
+    before, counts for nothing.
     """
 
     spread_rad: Annotated[float, limits("rad", gt=0.0)]
     spread_nm: Annotated[float, limits("Nm", gt=0.0)]
     scale: Annotated[tuple[float, float, float, float], limits()]
     correlation_s: Annotated[float, limits("s", gt=0.0, le=10.0)] | None = None
-    early: Annotated[float, limits(ge=1.0, le=10.0)] = 1.0
+    early: Annotated[float, limits(ge=1.0, le=10.0)] | None = None
 
     def __post_init__(self) -> None:
         check(self, "fused.zeros")

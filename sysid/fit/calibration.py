@@ -37,19 +37,13 @@ allowance for few runs covers both, so that it cannot hide an error at rest. k i
 stop there is no section, and the estimator takes 3 standard deviations. The torsion is that of the low pass of
 TORSION_BANDWIDTH_RAD_S: a tracked one is no noisier at rest.
 
-**Scale** (`calibrated`), the last step of a fit: factors of `fused.sigma` and `fused.zeros`, and `early` of the latter.
+**Scale** (`calibrated`), the last step of a fit: factors of `fused.sigma` and `fused.zeros`.
 
     |error| <= 1.645 sqrt((scale_q spread)^2 + more^2)      in COVERAGE of the samples of a held-out run, quadrant q,
                                                             and in QUIET of those with the lesser half of more/spread
 
 error, spread, more: below; with the torsion tracked, `fused.tracking` is in more, so that it is not counted twice.
 scale_q is the conformal quantile of sqrt(error^2 - (1.645 more)^2) over the spread.
-
-Before the offset of the day is known the error is wider than the variance that its correction removes. The ratio r of the
-conformal quantiles of the samples that know less than half of it and of the others, k and k' the means of what they know, is
-that of the factors of the spread (`fusion.pyx`):
-
-    (1 + (early - 1) (1 - k))/(1 + (early - 1) (1 - k')) = r
 
 The campaign has a sensor, not the torque. Both paths' run means share the sensor's offset in that run, of standard deviation
 `reference_nm`: a normal prior, and two normal measurements of it whose variance is the excess of each path's means. The
@@ -64,11 +58,11 @@ offsets), n runs have not shown the largest yet: 8 of them cover 87 % of others.
 Held-out residuals: the error of current path and torsion path on a run that the fit did not use, and of their fusion.
 
     error = e_c + alpha (e_t - e_c)                          with the delay of the motor path
-    spread = early sqrt(s_c^2 s_t^2/(s_c^2 + s_t^2))         early: the day's offset is not yet known
+    spread = sqrt(alpha) s_t                                 s_t: without the day's offset, which is in more
     error, no delay = e_tracked + (1 - alpha) (e_c - e_t')   e_t': of the tracked torsion through the motor path's filter
     more^2 = what widens sigma in the estimator beside that
 
-With `track_zeros` the corrections of both paths are in all of them. early, more: `track_run` of fusion.pyx.
+With `track_zeros` the corrections of both paths are in all of them. more: `track_run` of fusion.pyx.
 """
 
 from __future__ import annotations
@@ -237,8 +231,8 @@ class FusedErrors(NamedTuple):
     """Errors of the estimator in one run, arrays [n] of its samples in motion.
 
     undelayed: with the torsion tracked. spread: standard deviation of the torque, scale 1. more: what the estimator adds to
-    it. known: what the tracked offset takes off the torsion's variance. teacher: of `PathResiduals`. share: of the noise of
-    the tracked torsion in the variance: all where it is put on top of a delayed fusion, else by its weight.
+    it. teacher: of `PathResiduals`. share: of the noise of the tracked torsion in the variance: all where it is put on top
+    of a delayed fusion, else by its weight.
     """
 
     error_nm: FloatArray
@@ -247,7 +241,6 @@ class FusedErrors(NamedTuple):
     more_nm2: FloatArray
     velocity_rad_s: FloatArray
     quadrant: QuadrantArray
-    known_nm2: FloatArray
     teacher_nm: FloatArray = NONE
     share: FloatArray = NONE
 
@@ -259,13 +252,13 @@ def fused_errors(
 
     rated_nm None, or a joint without torsion: nothing is learned in the run, and nothing widens the spread.
     """
-    none = torsion = current = more = known = np.zeros(len(run.raw_nm))
+    none = torsion = current = more = np.zeros(len(run.raw_nm))
     tracks = fused.tracking is not None and len(run.ahead_nm) > 0
     if rated_nm is None or fused.torsion is None or not len(run.dt_s):
         fusion = Fusion(replace(fused.sigma, reference_nm=0.0), fused.torsion is not None)
         alpha, _, spread, _ = fusion.fuse(*run.fusion_inputs)
     else:
-        alpha, torsion, current, spread, more, known = track_run(
+        alpha, torsion, current, spread, more, _ = track_run(
             fused,
             rated_nm,
             run.dt_s,
@@ -289,7 +282,6 @@ def fused_errors(
         more,
         run.velocity_rad_s,
         quadrants(run.raw_nm, run.velocity_rad_s),
-        known,
         run.teacher_nm,
         np.where(run.now, alpha * alpha, 1.0) if len(run.now) else np.ones(len(alpha)),
     )
@@ -545,18 +537,13 @@ OTHER_MOTIONS_LEARNED: Final = 0.01
 other motions are covered by as much less. Chosen on runs that no figure is reported on."""
 QUIET: Final = 0.85
 """Coverage, at least, of the half of the samples that is widened less: elsewhere what widens sigma covers nearly all."""
-HALF_KNOWN: Final = 0.5
-LATEST: Final = 2.0
-"""Largest `early`."""
-_FEWEST_RUNS: Final = 8
-"""That have samples of either kind, for `early`."""
 _QUANTILES: Final = 7
 _LEAST_NM2: Final = 1e-4
 """Variance of a path's run means beside the sensor's offset: no path is free of an error of its own."""
 
 
 def calibrated(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> Fused:
-    """Return a section with both scales and `early` found on held-out runs; its other parts are final.
+    """Return a section with both scales found on held-out runs; its other parts are final.
 
     Without section `fused.zeros` new configurations track offsets with the scale of sigma, which is then that of tracked
     ones.
@@ -586,33 +573,9 @@ def calibrated(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> 
         return replace(fused, sigma=replace(fused.sigma, scale=scale(errors, COVERAGE)))
     errors = errors_of(replace(fused, zeros=None), track_zeros=False)
     sigma = replace(fused.sigma, scale=scale(errors, COVERAGE + OTHER_MOTIONS))
-    days = replace(fused.zeros, early=1.0)
-    errors = errors_of(replace(fused, zeros=days), track_zeros=True)
-    days = replace(days, early=early_factor(beyond(errors), errors, days.spread_nm))
-    errors = errors_of(replace(fused, zeros=days), track_zeros=True)
-    days = replace(days, scale=scale(errors, COVERAGE + OTHER_MOTIONS_LEARNED))
+    errors = errors_of(fused, track_zeros=True)
+    days = replace(fused.zeros, scale=scale(errors, COVERAGE + OTHER_MOTIONS_LEARNED))
     return replace(fused, sigma=sigma, zeros=days)
-
-
-def early_factor(beyond: Sequence[FloatArray], runs: Sequence[FusedErrors], spread_nm: float) -> float:
-    """Return the factor of the spread where nothing is known of the day's offset; runs: with a factor of 1.
-
-    beyond: what of each run's errors the spread has to cover [Nm]. 1 where too few runs show it.
-    """
-    known = [run.known_nm2 / spread_nm**2 for run in runs]
-    kinds = ([k < HALF_KNOWN for k in known], [k >= HALF_KNOWN for k in known])
-    quantiles, shares = [], []
-    for kind in kinds:
-        kept = [n for n, keep in enumerate(kind) if np.count_nonzero(keep) >= FEWEST]
-        if len(kept) < _FEWEST_RUNS:
-            return 1.0
-        quantiles.append(quantile_by_runs([(beyond[n] / runs[n].spread_nm)[kind[n]] for n in kept]))
-        shares.append(float(np.mean([known[n][kind[n]].mean() for n in kept])))
-    if not quantiles[0] > quantiles[1]:
-        return 1.0
-    more = quantiles[0] - quantiles[1]
-    less = (1.0 - shares[0]) * quantiles[1] - (1.0 - shares[1]) * quantiles[0]
-    return 1.0 + more / less if more < (LATEST - 1.0) * less else LATEST
 
 
 def sensor_offsets(runs: Sequence[PathResiduals], reference_nm: float) -> tuple[FloatArray, float]:

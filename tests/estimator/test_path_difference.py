@@ -417,50 +417,35 @@ def test_its_scale_counts_where_zeros_are_tracked() -> None:
     half = faded(model.loss_many(raw, v, columns[5][on], s)[1], columns[0][on], on >= 0)
     known = np.full(len(on), UNSEEN * DAYS.spread_nm**2)
     paths = Fusion(replace(joint.fused.sigma, reference_nm=0.0), True)
-    spread = paths.fuse(raw, half, v, seen.torsion_nm[on], seen.open_nm[on], known_nm2=known).sigma_nm
+    file = (raw, half, v, seen.torsion_nm[on], seen.open_nm[on])
+    alpha, (share, *_, variance) = paths.fuse(*file, known_nm2=known).alpha, paths.fuse(*file)
+    rest = (1.0 - share) * variance - DAYS.spread_nm**2  # of the torsion, without the day's offset
+    spread = np.sqrt(alpha * rest)
     scale = np.array(joint.fused.zeros.scale)[quadrants(raw, v)]  # type: ignore[union-attr]
     np.testing.assert_allclose(part[on], (scale * spread) ** 2, rtol=1e-6)
     assert (found.sigma_nm[on] ** 2 - part[on]).min() > 0.0
 
 
-def test_before_the_zero_is_known_the_spread_is_wider_by_a_factor_that_fades() -> None:
-    """The factor is 1 + (early - 1) (1 - known/S^2)."""
-    columns, _ = driven(8.0, link_zero_rad=2e-5)
-    wary = with_section(zeros=replace(DAYS, early=1.8))
-    one, other = (tracked(columns, each)[0] for each in (LEARNING, wary))
-    assert one.torque_nm.tobytes() == other.torque_nm.tobytes()
-    part, wider = (of_scale(columns, each) for each in (LEARNING, wary))
-    moving = np.isfinite(part)
-    factor = np.sqrt(wider[moving] / part[moving])
-    np.testing.assert_allclose(
-        (other.sigma_nm**2 - one.sigma_nm**2)[moving], (factor**2 - 1.0) * part[moving], rtol=1e-6
-    )
-    assert factor[0] == pytest.approx(1.8 - 0.8 * UNSEEN, rel=1e-9)
-    assert factor.max() <= 1.8 + 1e-9
-    assert 1.0 < factor[-1] < 1.4
-    off, wide = (FusedEstimator(joint, OFF).run(*columns) for joint in (LEARNING, wary))
-    assert off.sigma_nm.tobytes() == wide.sigma_nm.tobytes()
+def test_what_is_not_known_of_the_day_counts_whole_up_to_its_weight() -> None:
+    """Paths that agree in motion one way may share their error: with motion both ways it is known."""
+    assert LEARNING.fused is not None
+    one = np.ones(4000)
+    for v, bounded in ((one, True), (np.sin(2.5e-3 * np.arange(4000) + 0.4), False)):
+        run = run_of(v, 0.0 * one, 5.0 * one)
+        (alpha, *_, more, known), (*_, others, _) = (
+            track_run(LEARNING.fused, 40.0, *run, on) for on in (True, False)
+        )
+        expected = alpha * DAYS.spread_nm**2 if bounded else DAYS.spread_nm**2 - known
+        np.testing.assert_allclose((more - others)[3000:], expected[3000:], rtol=1e-6, atol=1e-9)
 
 
-def test_without_the_key_nothing_is_wider() -> None:
+def test_a_file_with_the_factor_of_before_is_read_and_the_same() -> None:
     mapping = LEARNING.to_mapping()
-    del mapping["fused"]["zeros"]["early"]
-    old = Joint.from_mapping(mapping, "a.yaml")
-    assert old.fused is not None
-    assert old.fused.zeros is not None
-    assert old.fused.zeros.early == 1.0
-    columns, _ = driven(4.0, link_zero_rad=2e-5)
-    dt, _, motor, *_ = columns
-    v, one = np.gradient(motor / 100.0, 1e-3), np.ones(len(dt))
-    run = run_of(v, 0.1 * one, 5.0 * one)
-    spread, wider = (
-        track_run(replace(old.fused, zeros=replace(old.fused.zeros, early=early)), 40.0, *run)[3]
-        for early in (old.fused.zeros.early, 1.5)
-    )
-    paths = Fusion(replace(old.fused.sigma, reference_nm=0.0), True)
-    *_, known = track_run(old.fused, 40.0, *run)
-    assert spread == pytest.approx(paths.fuse(*run[1:6], known_nm2=known).sigma_nm, rel=1e-3)
-    assert wider == pytest.approx(spread * (1.5 - 0.5 * known / old.fused.zeros.spread_nm**2), rel=1e-12)
+    assert "early" not in mapping["fused"]["zeros"]
+    mapping["fused"]["zeros"]["early"] = 1.8
+    columns, _ = driven(2.0, link_zero_rad=2e-5)
+    old = tracked(columns, Joint.from_mapping(mapping, "a.yaml"))[0]
+    assert old.sigma_nm.tobytes() == tracked(columns, LEARNING)[0].sigma_nm.tobytes()
 
 
 # ---- agreement

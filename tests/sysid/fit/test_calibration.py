@@ -21,7 +21,6 @@ from jtqd.sysid.fit import calibration
 from jtqd.sysid.fit.calibration import (
     COVERAGE,
     FEWEST_RUNS,
-    LATEST,
     OTHER_MOTIONS,
     OTHER_MOTIONS_LEARNED,
     SATURATION_RAD_S,
@@ -31,7 +30,6 @@ from jtqd.sysid.fit.calibration import (
     bent_square,
     calibrated,
     conformal_scale,
-    early_factor,
     fit_sigma,
     fit_standstill,
     fit_tracking,
@@ -46,7 +44,7 @@ from jtqd.sysid.fit.fused import fit_zeros
 from jtqd.sysid.fit.signals import UNIT_TORSION, run_signals
 from jtqd.sysid.fit.torsion import TRACKING_RAD_S, WAVE_RAD_S
 from tests.estimator.estimator_helpers import first_order_hold, joint1
-from tests.estimator.fused_helpers import AGREEMENT, DAYS, LEARNING, driven, twisted, wavier
+from tests.estimator.fused_helpers import AGREEMENT, LEARNING, driven, twisted, wavier
 from tests.estimator.test_torsion_filters import lossless
 from tests.sysid.fit.fused_signals import FUSED, STIFF, made_run, smooth_loss
 from tests.sysid.fit.test_repeatability import RATED, fused, runs_of_days
@@ -136,10 +134,8 @@ def test_the_error_of_the_fused_value_is_that_of_fused_paths_less_the_sensor() -
 def test_value_and_sigma_are_those_of_the_estimator(track_zeros: bool) -> None:
     assert LEARNING.fused is not None
     tracking = Tracking(TRACKING_RAD_S, 0.1, 0.3, WAVE_RAD_S, 0.5)
-    agreement, zeros = replace(AGREEMENT, zero_factor=1.3), replace(DAYS, early=1.7)
-    joint = replace(
-        LEARNING, fused=replace(LEARNING.fused, agreement=agreement, tracking=tracking, zeros=zeros)
-    )
+    agreement = replace(AGREEMENT, zero_factor=1.3)
+    joint = replace(LEARNING, fused=replace(LEARNING.fused, agreement=agreement, tracking=tracking))
     assert joint.fused is not None
     inputs, _ = driven(8.0, link_zero_rad=4e-5)
     dt, current, motor, velocity, link, temperature = inputs
@@ -515,32 +511,13 @@ def test_where_sigma_is_widened_hides_no_error_elsewhere(monkeypatch: pytest.Mon
 
     def errors(_: PathResiduals, *__: object, **___: object) -> FusedErrors:
         more = np.where(np.arange(n) % 2 == 0, 100.0, 0.0)
-        return FusedErrors(rng.normal(size=n), none, one, more, one, np.zeros(n, np.intp), none)
+        return FusedErrors(rng.normal(size=n), none, one, more, one, np.zeros(n, np.intp))
 
     monkeypatch.setattr(calibration, "fused_errors", errors)
     section = replace(fused(), agreement=None, zeros=None)
     section = replace(section, sigma=replace(section.sigma, reference_nm=0.0))
     found = calibrated(runs_of_sensor(np.zeros(20)), section, RATED)
     assert found.sigma.scale[0] == pytest.approx(1.4395 / GAUSS, rel=0.02)
-
-
-def of_day(known: float, error_nm: float, rng: np.random.Generator) -> tuple[FusedErrors, np.ndarray]:
-    """A run whose first half knows nothing of its offset of 0.2 Nm, the second half this part; and its errors."""
-    n = 1000
-    part = np.where(np.arange(n) < n // 2, 0.0, known)
-    one, none = np.ones(n), np.zeros(n)
-    error = np.abs(rng.normal(0.0, 1.0, n)) * np.where(part > 0.0, 1.0, error_nm)
-    return FusedErrors(error, none, one, none, one, np.zeros(n, np.intp), 0.04 * part), error
-
-
-@pytest.mark.parametrize("wider", [0.7, 1.0, 1.4, 9.0])
-def test_the_wider_error_before_the_offset_is_known_is_found(wider: float) -> None:
-    rng = np.random.default_rng(3)
-    runs, errors = zip(*[of_day(0.8, wider, rng) for _ in range(40)], strict=True)
-    # at 0.8 known the spread is still wider by a fifth: early/(1 + 0.2 (early - 1)) = wider
-    expected = min(max((wider - 0.2 * wider) / (1.0 - 0.2 * wider), 1.0), LATEST) if wider < 5.0 else LATEST
-    assert early_factor(errors, runs, 0.2) == pytest.approx(expected, rel=0.06)
-    assert early_factor(errors[:7], runs[:7], 0.2) == 1.0
 
 
 def test_where_offsets_differ_from_day_to_day_runs_are_covered_more_for_other_motions() -> None:
