@@ -35,8 +35,8 @@ the same sample. A step of a reading is in order where it continues the last ste
     unseen  = sum of omega_m dt while the reading stands still; link encoder: or what the current has changed by
     slipped = range, over RANGE_S, of sum(theta_m(k) - theta_m(k-1) - omega_m dt (1 + scale) - lag (omega_m dt less the last)), beyond
               max(NOISE_SIGMAS times what is usual in motion, LEAST_SLIPPED tolerances) and lag^2 times the acceleration over it
-    longer  = samples by which a run of equal ones at rest is longer than healthy noise gives with exp(-RARE); their mean
-              is that of runs at rest, of channels that have been noisy. After a gap these are alive when a sample has differed
+    longer  = samples by which a run of equal ones at rest is longer than healthy noise gives with exp(-RARE): with n of them seen,
+              (1 + run/(n (mean + 1/2)))^-n (Lomax 1954). After a gap a joint with KNOWN_RUNS is alive when a sample has differed
     doubt   = max(|off|, |unseen|) - TOLERANCE, slipped, or LOAD_HZ longer dt: how far the fastest load may have gone
     louder  = mean square of the second differences of theta_m/G - theta_l, by 6, less SURELY times what the file's sigma has
 
@@ -73,7 +73,7 @@ During a contact, neither w nor z adapts: m is the size of the push. The load ma
 when the push ends; a step back is taken from a second trend, of e since the contact began.
 """
 
-from libc.math cimport INFINITY, NAN, cos, fabs, isfinite, isnan, log, log1p, sin, sqrt
+from libc.math cimport INFINITY, NAN, cos, expm1, fabs, isfinite, isnan, log, sin, sqrt
 from libc.stdint cimport uint8_t, uint64_t
 from libc.string cimport memcpy, memset
 
@@ -255,7 +255,7 @@ cdef double CALM = 0.1  # samples out of order, of the last STRANGE_S
 cdef double FOLLOW_RATE = 50.0  # at which the torque follows the current
 # logarithms of how rarely healthy noise gives so long a run of equal samples, of a joint's inputs and of its link encoder alone
 cdef double RARE_EQUAL = 10.0, RARE_STILL = 14.0
-cdef int KNOWN_RUNS = 64  # of equal samples at rest: their mean is known, and is a mean of so many
+cdef int KNOWN_RUNS = 64  # of equal samples at rest, that their mean is of at most
 
 
 cdef int fill_inputs(InputLaw *law, joint, torsion, double noise) except -1:
@@ -356,8 +356,8 @@ cdef double _too_long(Runs *r, bint equal, bint standing, double rare) noexcept 
     """
     cdef double beyond = 0.0
     cdef int still = r.still + equal
-    if still and standing and r.seen == KNOWN_RUNS:
-        beyond = still - rare / log1p(1.0 / max(r.usual, 1e-3))
+    if still and standing and r.seen:
+        beyond = still - r.seen * (r.usual + 0.5) * expm1(rare / r.seen)
     r.still = still if equal else 0
     if equal:
         return beyond

@@ -165,6 +165,17 @@ def test_what_ends_is_over_within_a_second(name: str) -> None:
     assert np.max(found.sigma_nm[last] - healthy.sigma_nm[last]) < 0.05 * RATED
 
 
+@pytest.mark.parametrize("at", [2450, 2500, 2550])
+def test_a_link_encoder_that_stops_soon_after_a_stop_is_found_by_the_few_runs_that_were_seen(at: int) -> None:
+    def stopped(values: FloatArray) -> FloatArray:
+        values[at : at + 300] = values[at]
+        return values
+
+    found = estimated(changed(link_rad=stopped))
+    assert held(found, slice(at - 50, at + 300))
+    assert found.sigma_nm[at + 60] > 0.1 * RATED
+
+
 def test_channels_without_noise_are_not_stuck() -> None:
     """Nothing is known of an encoder that has never been seen to be noisy."""
     still = Inputs(*(np.full(6000, 0.0) for _ in range(5)))
