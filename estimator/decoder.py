@@ -14,7 +14,7 @@ A range stands once, beside its field. msgspec holds the ranges and converts the
 value nor the unit, and it takes NaN, infinity and keys that no field has: keys, finiteness and messages are ours.
 
 A field is a value (float, int, bool, str, a tuple of numbers, or what `parsed` makes), a dataclass (a section), a tuple
-of dataclasses or of mappings (a list of sections) or a Mapping from str to values (a section with free keys). A key may
+of dataclasses or of mappings (a list of sections) or a Mapping from str to values or sections (free keys). A key may
 be left out where its field has a default or may be None; a section or list that is empty in the file counts as left out.
 `false` for a section that may be None and has another default is None.
 """
@@ -315,9 +315,9 @@ class Field:
             return _nested(self.inner, value, self.name)
         with below(self.name):
             free = _section(value)
-            return (
-                dict(free) if self.inner is None else {k: self.inner.convert(k, v) for k, v in free.items()}
-            )
+            if self.inner is None:
+                return dict(free)
+            return {key: replace(self.inner, name=key).read(free) for key in free}
 
     def convert(self, key: str, value: object) -> Any:
         """Return one value in the type of the field. Raises FieldError."""
