@@ -39,11 +39,11 @@ def renamed(handshake: bytes, name: str) -> bytes:
 class Gateway:
     """Listens at `address` (raises OSError), in a thread of its own.
 
-    inner: of the websocket server; None: there is none.
+    inner: of the websocket server; None: there is none. page: there is one.
     """
 
-    def __init__(self, address: Address, inner: Address | None) -> None:
-        self._inner, self._names = inner, web.local_names(address.host)
+    def __init__(self, address: Address, inner: Address | None, *, page: bool = True) -> None:
+        self._inner, self._names, self._page = inner, web.local_names(address.host), page
         self._loop = asyncio.new_event_loop()
         self._tasks: set[asyncio.Task[None]] = set()
         self._pages: set[asyncio.StreamWriter] = set()
@@ -128,6 +128,8 @@ class Gateway:
             elif protocols:
                 known = f"websocket subprotocols: {PROTOCOL}, {OLDER}" if self._inner else NEEDED
                 answer = web.text_answer(HTTPStatus.BAD_REQUEST, known)
+            elif not self._page:
+                answer = web.text_answer(HTTPStatus.NOT_FOUND, "no page: Foxglove and Lichtblick alone")
             else:
                 answer = web.answer(request, self._names)
         if answer is None and len(self._pages) >= _MOST:

@@ -107,24 +107,21 @@ _BACKLOG = 512
 class LiveServer:
     """Serves one channel per topic of the log, with the log's schema; `name` is what viewers show.
 
-    Needs the extra `live`. Raises RuntimeError, OSError where it cannot listen.
+    schemas, channels: records of the log. Needs the extra `live`. Raises RuntimeError, OSError where it cannot listen.
     """
 
-    def __init__(self, name: str, joints: int = 2, *, shadow: bool = False) -> None:
+    def __init__(self, name: str, schemas: Sequence[Any], channels: Sequence[Any]) -> None:
         import foxglove
 
-        texts = messages.schemas_of(joints, shadow=shadow)
         self._context = context = foxglove.Context()  # server and channels hold it only weakly
+        known = {
+            each.id: foxglove.Schema(name=each.name, encoding="ros2msg", data=each.data) for each in schemas
+        }
         self._channels = {
-            topic.number: foxglove.Channel(
-                topic.name,
-                message_encoding="cdr",
-                schema=foxglove.Schema(
-                    name=topic.schema, encoding="ros2msg", data=texts[topic.schema].encode()
-                ),
-                context=context,
+            each.id: foxglove.Channel(
+                each.topic, message_encoding="cdr", schema=known[each.schema_id], context=context
             )
-            for topic in messages.topics_of(joints, shadow=shadow)
+            for each in channels
         }
         self._server = foxglove.start_server(
             name=name,
@@ -150,7 +147,7 @@ class LiveServer:
         self._server.stop()
 
 
-def _obstacle(address: Address) -> str:
+def obstacle(address: Address) -> str:
     """Return why nobody can listen there, or nothing: the server's own message does not always contain it."""
     try:
         family, _, _, _, where = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0]
@@ -241,16 +238,16 @@ def serve(source: Source, gateway: Gateway, viewers: LiveServer | None, page: Pa
 def begin(request: dict[str, Any]) -> tuple[str, Callable[[Stop], int]]:
     """Open memory and servers; returns where they listen, and what serves. Raises CannotBegin."""
     address = Address(request["host"], request["port"])
-    obstacle = _obstacle(address)
-    if obstacle:
-        raise CannotBegin(f"{address.host}:{address.port}: {obstacle}")
+    why = obstacle(address)
+    if why:
+        raise CannotBegin(f"{address.host}:{address.port}: {why}")
     viewers = None
     try:
         source = Source(request)
         count, shadow = len(request["joint_names"]), request["shadow"]
         page = PageEvents(Path(request["snapshot"]).parent, count, shadow=shadow)
         if installed():
-            viewers = LiveServer(f"jtqd on {request['bus']}", count, shadow=shadow)
+            viewers = LiveServer(f"jtqd on {request['bus']}", *messages.definitions(count, shadow=shadow))
         gateway = Gateway(address, None if viewers is None else viewers.address)
     except (SharedMemoryError, RuntimeError, OSError, ValueError) as error:
         if viewers is not None:

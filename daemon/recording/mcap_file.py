@@ -277,9 +277,9 @@ class ChunkBuilder:
 
     def add(self, channel: int, time_ns: int, payload: bytes, sequence: int = 0) -> None:
         """Add one message; log time and publish time are the same."""
-        head = _MESSAGE.pack(Opcode.MESSAGE, 22 + len(payload), channel, sequence, time_ns, time_ns)
-        self._others.append((time_ns, channel, head + payload))
-        self._length += len(head) + len(payload)
+        record = message_record(channel, time_ns, payload, sequence)
+        self._others.append((time_ns, channel, record))
+        self._length += len(record)
 
     def seal(self) -> Span | None:
         """Return the messages added since the last call, or None."""
@@ -322,6 +322,11 @@ class ChunkBuilder:
         start = min(min(each[0::2]) for each in indexed.values())
         end = max(max(each[0::2]) for each in indexed.values())
         return seal(Chunk(_COMPRESSION, self._compress(raw), end, start, zlib.crc32(raw), len(raw)), indexed)
+
+
+def message_record(channel: int, time_ns: int, payload: bytes, sequence: int = 0) -> bytes:
+    """Return a Message record; log time and publish time are the same."""
+    return _MESSAGE.pack(Opcode.MESSAGE, 22 + len(payload), channel, sequence, time_ns, time_ns) + payload
 
 
 def seal(chunk: Chunk, indexed: Mapping[int, Sequence[int]]) -> SealedChunk:

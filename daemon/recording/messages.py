@@ -251,14 +251,14 @@ int64 sync_monotonic_ns         # [ns] send time of the SYNC, CLOCK_MONOTONIC
 )
 
 
-def _complete(text: str, *nested: tuple[str, str]) -> str:
+def complete(text: str, *nested: tuple[str, str]) -> str:
     """Return a definition followed by those it uses, in the notation of `rosidl`."""
     return text + "".join(f"{'=' * 80}\nMSG: {name}\n{body}" for name, body in nested)
 
 
 ZEROS_SCHEMA = "jtqd_msgs/msg/Zeros"
 SHADOW_SCHEMA = "jtqd_msgs/msg/ShadowEstimate"
-_NESTED_HEADER = (("std_msgs/Header", _HEADER), ("builtin_interfaces/Time", _TIME))
+NESTED_HEADER = (("std_msgs/Header", _HEADER), ("builtin_interfaces/Time", _TIME))
 
 
 def schemas_of(joints: int, *, shadow: bool = False) -> dict[str, str]:
@@ -267,19 +267,19 @@ def schemas_of(joints: int, *, shadow: bool = False) -> dict[str, str]:
     frames = _CAN_FRAMES % {"capacity": capacity}
     event = _EVENT % {"numbers": "1 or 2" if joints == 2 else "from 1 on"}
     return {
-        "jtqd_msgs/msg/JointEstimate": _complete(_JOINT_ESTIMATE, *_NESTED_HEADER),
-        frames_name(joints): _complete(frames, *_NESTED_HEADER, ("jtqd_msgs/CanFrame", _CAN_FRAME)),
-        "sensor_msgs/msg/JointState": _complete(_JOINT_STATE, *_NESTED_HEADER),
-        "diagnostic_msgs/msg/DiagnosticArray": _complete(
+        "jtqd_msgs/msg/JointEstimate": complete(_JOINT_ESTIMATE, *NESTED_HEADER),
+        frames_name(joints): complete(frames, *NESTED_HEADER, ("jtqd_msgs/CanFrame", _CAN_FRAME)),
+        "sensor_msgs/msg/JointState": complete(_JOINT_STATE, *NESTED_HEADER),
+        "diagnostic_msgs/msg/DiagnosticArray": complete(
             "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status\n",
-            *_NESTED_HEADER,
+            *NESTED_HEADER,
             ("diagnostic_msgs/DiagnosticStatus", _DIAGNOSTIC_STATUS),
             ("diagnostic_msgs/KeyValue", "string key\nstring value\n"),
         ),
-        "jtqd_msgs/msg/Event": _complete(event, *_NESTED_HEADER),
-        "rcl_interfaces/msg/Log": _complete(_LOG, ("builtin_interfaces/Time", _TIME)),
-        ZEROS_SCHEMA: _complete(_ZEROS, *_NESTED_HEADER),
-        **({SHADOW_SCHEMA: _complete(_SHADOW, *_NESTED_HEADER)} if shadow else {}),
+        "jtqd_msgs/msg/Event": complete(event, *NESTED_HEADER),
+        "rcl_interfaces/msg/Log": complete(_LOG, ("builtin_interfaces/Time", _TIME)),
+        ZEROS_SCHEMA: complete(_ZEROS, *NESTED_HEADER),
+        **({SHADOW_SCHEMA: complete(_SHADOW, *NESTED_HEADER)} if shadow else {}),
     }
 
 
@@ -333,14 +333,17 @@ TOPICS = topics_of(2)
 
 
 def definitions(joints: int = 2, *, shadow: bool = False) -> tuple[list[Schema], list[Channel]]:
-    """Return the schema and channel records of every topic."""
+    """Return the schema and channel records of every topic of a bus."""
     texts = schemas_of(joints, shadow=shadow)
-    numbers = {name: number for number, name in enumerate(texts, start=1)}
-    records = [Schema(numbers[name], text.encode(), "ros2msg", name) for name, text in texts.items()]
-    return records, [
-        Channel(topic.number, topic.name, "cdr", {}, numbers[topic.schema])
-        for topic in topics_of(joints, shadow=shadow)
-    ]
+    return records_of({each: texts[each.schema] for each in topics_of(joints, shadow=shadow)})
+
+
+def records_of(texts: Mapping[Topic, str]) -> tuple[list[Schema], list[Channel]]:
+    """Return the schema and channel records of topics with their definitions."""
+    names = {each.schema: text.encode() for each, text in texts.items()}
+    numbers = {name: number for number, name in enumerate(names, start=1)}
+    schemas = [Schema(numbers[name], data, "ros2msg", name) for name, data in names.items()]
+    return schemas, [Channel(each.number, each.name, "cdr", {}, numbers[each.schema]) for each in texts]
 
 
 # ---- CDR ----

@@ -388,6 +388,16 @@ def test_a_page_that_does_not_read_loses_events_and_others_do_not():
     stuck.socket.close()
 
 
+def test_a_gateway_without_a_page_answers_in_one_line():
+    gateway = Gateway(Address(port=0), None, page=False)
+    with socket.create_connection(("127.0.0.1", gateway.port), 5.0) as asking:
+        asking.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        answer = b"".join(iter(lambda: asking.recv(4096), b""))
+    gateway.stop()
+    assert answer.startswith(b"HTTP/1.1 404 ")
+    assert answer.count(b"\n", answer.index(b"\r\n\r\n") + 4) == 1
+
+
 def test_ten_pages_get_the_same_numbers(live):
     before = (live.running.directory / "snapshot").read_bytes()[:8]
     pages = [Page(live.port) for _ in range(10)]
