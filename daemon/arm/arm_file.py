@@ -135,7 +135,7 @@ def load_arm(path: Path) -> ArmConfig:
     where = str(path)
     file = decode(ArmFile, mapping, where)
     # an arm has no ring of its own, and no fault that a flight recorder waits for
-    of_loop = {"ring_cycles": RecordingSettings.ring_cycles, "flight_recorder_s": None}
+    of_loop: dict[str, Any] = {"ring_cycles": RecordingSettings.ring_cycles, "flight_recorder_s": None}
     recording = decode(RecordingSettings, file.recording, where, "recording", **of_loop)
     urdf = path.parent / file.urdf
     return ArmConfig(

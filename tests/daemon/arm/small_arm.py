@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import yaml
+
+from jtqd.daemon.shared.cycle_record import HEADER, JOINT, TAIL, Header, JointRecord, layout_of
 
 _LINK = """
   <link name="{name}">
@@ -47,3 +50,21 @@ def write(folder: Path, mapping: dict[str, Any] | None = None, urdf: str = URDF)
     path = folder / "arm.yaml"
     path.write_text(yaml.safe_dump(content() if mapping is None else mapping, sort_keys=False))
     return path
+
+
+NOTHING = JointRecord(*[math.nan] * 16, 0, 0, 0, 0)
+REALTIME_OFFSET_NS = 1_700_000_000_000_000_000
+
+
+def record_of(sync_ns: int, *joints: JointRecord, cycle: int = 0) -> bytes:
+    """A whole cycle record, byte by byte as the loop leaves it."""
+    layout = layout_of(len(joints))
+    made = bytearray(layout.size)
+    header = Header(*[0] * len(Header._fields))._replace(
+        cycle=cycle, sync_monotonic_ns=sync_ns, sync_realtime_ns=sync_ns + REALTIME_OFFSET_NS
+    )
+    HEADER.pack_into(made, 0, *header)
+    for n, joint in enumerate(joints):
+        JOINT.pack_into(made, HEADER.size + n * JOINT.size, *joint)
+    TAIL.pack_into(made, layout.tail_offset, cycle)
+    return bytes(made)
