@@ -41,7 +41,10 @@ GROUPS = {
     "identify: parameters and networks from measured runs": {
         "campaign": ("jtqd.sysid.campaign.command", "move the joints of a bus, and record the runs"),
         "excitation": ("jtqd.sysid.planner.command", "design excitation trajectories"),
-        "fit": ("jtqd.sysid.fit.command", "fit efficiency, friction or losses of a joint file to runs"),
+        "fit": (
+            "jtqd.sysid.fit.command",
+            "fit efficiency, friction or losses of a joint file to runs; links of an arm",
+        ),
         "train": ("jtqd.sysid.train.command", "train a network per joint on runs (extra: train)"),
         "evaluate": (
             "jtqd.sysid.evaluate.command",
@@ -60,8 +63,8 @@ GROUPS = {
 }
 """Heading -> subcommand -> (module, one line of help)."""
 
-FORMS = {("init", "--from-csv"): "jtqd.sysid.runs.from_csv"}
-"""Subcommand and the option with which another module is called."""
+FORMS = {("init", "--from-csv"): "jtqd.sysid.runs.from_csv", ("fit", "arm"): "jtqd.sysid.arm.command"}
+"""Subcommand and the option, or the first word, with which another module is called."""
 
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 
@@ -97,7 +100,7 @@ def main(argv: list[str] | None = None) -> int:
         hint = f"; did you mean {near[0]!r}?" if near else ""
         print(f"jtq: no command {name!r}{hint} (jtq --help lists them)", file=sys.stderr)
         return 2
-    given = {each.partition("=")[0] for each in arguments[1:]}
+    given = {each.partition("=")[0] for k, each in enumerate(arguments[1:]) if k == 0 or each.startswith("-")}
     module = next(
         (module for (of, option), module in FORMS.items() if of == name and option in given), command[0]
     )

@@ -36,7 +36,7 @@ _EXTERNAL = """\
 # What each joint of the arm feels at one instant, in the order of the URDF, and what went into the estimate.
 # Torques act on the link side, positive along the joint's angle. NaN: not known.
 std_msgs/Header header          # instant of the numbers, CLOCK_REALTIME
-string[] name
+string joints                   # their names in this order, a space between
 uint64 cycle                    # of the estimator
 int64 monotonic_ns              # [ns] instant of the numbers, CLOCK_MONOTONIC, as sync_monotonic_ns of jtqd's log
 float64[{n}] position_rad         # [rad] by the link encoder, from the URDF's zero
@@ -115,7 +115,7 @@ class ArmMessages:
     def __init__(self, model: ArmModel, tool: str, period_ns: int) -> None:
         self._period_ns = period_ns
         self._every = external_of(model.n)
-        self._names = _head("", *model.joints).align(8).body()[8:]
+        self._names = _head("").text(" ".join(model.joints)).align(8).body()[8:]
         self._state = _head("", *model.joints).put("I", model.n).align(8).body()[8:], _time(0, model.n)
         self._links = [_head(each).align(8).body()[8:] for each in links_of(model)]
         self._tool = _head(tool).align(8).body()[8:]

@@ -73,8 +73,8 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str]) -> int:
-    """Fit and write; returns the exit status."""
-    options = parser().parse_args(argv)
+    """Fit and write; argv begins with `arm`. Returns the exit status."""
+    options = parser().parse_args(argv[1:])
     try:
         check_installed("arm", "pinocchio")
         payloads = _payloads(options.payload, options.logs)
@@ -93,7 +93,7 @@ def main(argv: list[str]) -> int:
         )
         groups = [(path, _runs(path, model, payload)) for path, payload in payloads.items()]
         result = _fit(model, groups)
-        result |= {"command": shlex.join(["jtq", "fit", "arm", *argv]), "version": __version__}
+        result |= {"command": shlex.join(["jtq", "fit", *argv]), "version": __version__}
         result["date"] = dt.datetime.now(dt.UTC).isoformat(timespec="seconds")
         _write(options.out, config, model, result)
     except (OneLineError, LogError, OSError) as error:
@@ -126,7 +126,7 @@ def _payloads(words: Sequence[str], logs: Sequence[Path]) -> dict[Path, Payload]
 def _runs(path: Path, model: ArmModel, payload: Payload) -> list[FreeMotion]:
     """Return the parts of a log without gaps. Raises OneLineError."""
     table = read_topic(path, _TOPIC)
-    names = tuple(str(each) for each in np.atleast_1d(table["name"][0]))
+    names = tuple(bytes(table["joints"][0]).decode("utf-8", "replace").split())
     if names != model.joints:
         raise ConfigError(f"{path}: found joints {', '.join(names)}, expected {', '.join(model.joints)}")
     time_ns = np.asarray(table["monotonic_ns"], np.int64)

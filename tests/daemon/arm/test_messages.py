@@ -70,7 +70,7 @@ def test_every_field_of_a_cycle(model: ArmModel) -> None:
     (name, time_ns, external), (wrench_name, _, wrench), *others = made(model, 21)[-1][0]
     assert (name, time_ns) == ("/arm/external", 17 * 10**17 + 20 * MS)
     assert external["header"]["stamp"] == {"sec": 17 * 10**8, "nanosec": 20 * MS}
-    assert external["name"] == ["shoulder", "elbow"]
+    assert external["joints"] == "shoulder elbow"
     assert (external["cycle"], external["monotonic_ns"]) == (20, BEGIN + 20 * MS)
     assert external["position_rad"] == pytest.approx([0.52, -0.23])
     assert (external["torque_nm"], external["torque_sigma_nm"]) == ([10.0, 20.0], [0.1, 0.2])
