@@ -274,3 +274,7 @@ def _inertial(theta: Array) -> ET.Element:
     ET.SubElement(element, "mass", value=f"{mass:.9g}")
     ET.SubElement(element, "inertia", {key: f"{value:.9g}" for key, value in own.items()})
     return element
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(["arm", *sys.argv[1:]]))
