@@ -43,7 +43,7 @@ GROUPS = {
         "excitation": ("jtqd.sysid.planner.command", "design excitation trajectories"),
         "fit": (
             "jtqd.sysid.fit.command",
-            "fit efficiency, friction or losses of a joint file to runs; links of an arm",
+            "fit sections of a joint file to runs; links of an arm",
         ),
         "train": ("jtqd.sysid.train.command", "train a network per joint on runs (extra: train)"),
         "evaluate": (
