@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from jtqd.daemon.logs.read import read_topic
 from jtqd.estimator.status import PUBLISHED
 from tests.daemon.test_arm import interfaces  # noqa: F401 (a fixture)
-from validation.arm.arm import CYCLE_S, JOINTS, Arm, Readings, Run, read
+from validation.arm.arm import CYCLE_S, JOINTS, TOOL, URDF, Arm, Contact, Readings, Run, Truth, read
 from validation.arm.joints import RealJoints, towed
 from validation.arm.nodes import BUSES, WAITING, DaySource, ratings_of, write_arm
 
@@ -51,8 +52,11 @@ def test_daemons_on_four_buses_estimate_the_arm_at_the_same_instants(tmp_path: P
     joints = RealJoints(arm, *towed(arm, runs=6, seconds=5.0))
     pose = np.array([0.3, -0.3, 0.0, -2.2, 0.0, 2.0, 0.4])
     t = CYCLE_S * np.arange(round(SECONDS / CYCLE_S))
-    run = Run(1, pose + 0.3 * (1.0 - np.cos(2.0 * np.pi * t[:, None] / np.linspace(2.0, 3.5, JOINTS))))
-    readings = read(arm, run, arm.record([run])[0], joints)
+    path = pose + 0.3 * (1.0 - np.cos(2.0 * np.pi * t[:, None] / np.linspace(2.0, 3.5, JOINTS)))
+    push = Contact("push", 2.5, 2.51, 3.2, 7, (0.0, 0.0, 0.1), (30.0, 0.0, 0.0))
+    run = Run(1, path, contacts=(push,))
+    truth = arm.record([run])[0]
+    readings = read(arm, run, truth, joints)
     write_arm(tmp_path, arm, joints, readings)
     begin = time.monotonic_ns() + round(1e9 * READY_S)
     with ExitStack() as stack:
@@ -60,7 +64,8 @@ def test_daemons_on_four_buses_estimate_the_arm_at_the_same_instants(tmp_path: P
             started(stack, tmp_path, number, f"vcan{number - 1}", begin)
             for number in range(1, len(BUSES) + 1)
         ]
-        for jtqd in running:
+        above = stack.enter_context(arm_started(tmp_path, begin))
+        for jtqd in (*running, above):
             _, error = jtqd.communicate(timeout=60)
             assert jtqd.returncode == 0, error
     begun_ns = []
@@ -70,6 +75,59 @@ def test_daemons_on_four_buses_estimate_the_arm_at_the_same_instants(tmp_path: P
                 checked(sorted((tmp_path / f"log_{number}").glob("*.mcap")), node, joint, arm, readings)
             )
     assert np.ptp(begun_ns) <= 1.5e6
+    check_arm(tmp_path, arm, truth, push, begin)
+
+
+def arm_started(folder: Path, begin_ns: int) -> subprocess.Popen[str]:
+    """Start jtqd-arm beside the daemons."""
+    joints = {
+        f"panda_joint{joint}": {"bus": f"vcan{number}", "joint": node, "direction": 1, "zero_rad": 0.0}
+        for number, on_bus in enumerate(BUSES)
+        for node, joint in enumerate(on_bus, start=1)
+    }
+    payload = {"mass_kg": 0.0, "centre_m": [0.0, 0.0, 0.0]}
+    content = {"urdf": str(URDF), "tool": TOOL, "joints": joints, "payload": payload}
+    (folder / "arm.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    duration_s = (begin_ns - time.monotonic_ns()) * 1e-9 + SECONDS - 0.3
+    return subprocess.Popen(
+        [
+            *(sys.executable, "-m", "jtqd.daemon.arm.command", str(folder / "arm.yaml"), "--json"),
+            *("--record", str(folder / "log_arm"), "--duration", str(duration_s)),
+        ],
+        env={**os.environ, "RUNTIME_DIRECTORY": str(folder / "run")},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def check_arm(folder: Path, arm: Arm, truth: Truth, push: Contact, begin_ns: int) -> None:
+    """Check external torque and contact in the log of jtqd-arm by the truth of the same instants."""
+    log = sorted((folder / "log_arm").glob("*.mcap"))
+    external = read_topic(log, "/arm/external")
+    row = np.round((external["monotonic_ns"] - begin_ns) * 1e-6).astype(int) - 13  # of the filter
+    pushed = (row > 1e3 * push.full_s + 30.0) & (row < 1e3 * push.end_s)
+    free = (row > 1500) & (row < 1e3 * push.start_s)
+    assert pushed.sum() > 300
+    assert free.sum() > 300
+    off = external["external_nm"] - truth.external_nm[np.clip(row, 0, len(truth.external_nm) - 1)]
+    assert np.nanmean(np.isfinite(off[pushed | free])) > 0.9
+    size = np.sqrt(np.nanmean((off[pushed | free] / arm.rated_nm) ** 2, axis=0))
+    assert (size < 0.04).all()  # links are 10 % and 5 mm off the URDF
+    felt = np.nanmean(external["external_nm"][pushed], axis=0)
+    true = truth.external_nm[row[pushed]].mean(axis=0)
+    assert felt[np.argmax(np.abs(true))] == pytest.approx(true[np.argmax(np.abs(true))], rel=0.35)
+    contact = read_topic(log, "/arm/contact")
+    clocks = {
+        name: table["header"]["stamp"]["sec"].astype(np.int64) * 10**9 + table["header"]["stamp"]["nanosec"]
+        for name, table in (("contact", contact), ("external", external))
+    }
+    ahead = clocks["external"][0] - external["monotonic_ns"][0] + begin_ns
+    at = (clocks["contact"] - ahead) * 1e-9
+    during = (at > push.full_s + 0.05) & (at < push.end_s)
+    before = (at > 1.5) & (at < push.start_s)
+    assert (contact["link"][during] == push.link).mean() > 0.8
+    assert not contact["link"][before].any()
 
 
 def started(stack: ExitStack, folder: Path, number: int, bus: str, begin_ns: int) -> subprocess.Popen[str]:
