@@ -147,8 +147,7 @@ cdef class Plausibility:
     def __init__(self, joint, double torque_limit, limits, double period_s=0.001):
         self.gap_s = GAP_PERIODS * period_s
         self.per_turn = 1.0 / joint.gear_ratio
-        self.jump = limits.motor_jump_rad
-        self.limit = limits.mismatch_rad
+        self.jump, self.limit = limits.motor_jump_rad, limits.mismatch_rad
         self.longest_frozen_s = limits.frozen_s
         self.twist_limit = (2.0 * torque_limit * joint.rated_torque_nm / joint.stiffness_nm_per_rad + limits.twist_rad)
         self.twist_jump = 0.5 * self.twist_limit
@@ -158,8 +157,7 @@ cdef class Plausibility:
         """Forget everything: the next sample is the reference."""
         self.low = self.high = NAN
         self.motor = self.twist = self.current = self.frozen_from = NAN
-        self.frozen_s = 0.0
-        self.mismatch_rad = 0.0
+        self.frozen_s = self.mismatch_rad = 0.0
         self.slip = LEAST_SLIP
         memset(&self.samples, 0, sizeof(Samples))
 
@@ -182,14 +180,11 @@ cdef class Plausibility:
         cdef bint repeats = _repeats(&self.samples, word, jumped, still)
         self.slip = max(fabs(slip), self.slip - (self.slip - LEAST_SLIP) * min(dt_s / SLIP_S, 1.0))
         self.mismatch_rad = self.mismatch_rad * (1.0 - dt_s * FORGET_RATE) + slip
-        self.motor = motor_position
-        self.twist = twist
+        self.motor, self.twist = motor_position, twist
         if current == self.current:
             self.frozen_s += dt_s
         else:
-            self.current = current
-            self.frozen_from = motor_position
-            self.frozen_s = 0.0
+            self.current, self.frozen_from, self.frozen_s = current, motor_position, 0.0
         if (
             -self.jump < slip < self.jump
             and -self.limit < self.mismatch_rad < self.limit
@@ -225,11 +220,7 @@ cdef class Plausibility:
             faults |= VELOCITY_MISMATCH
             # what is far beyond its limit, too, is forgotten soon after its end
             self.mismatch_rad *= min(WINDUP * (self.limit + LAG_S * fabs(velocity)) / fabs(self.mismatch_rad), 1.0)
-        if (
-            self.frozen_s >= self.longest_frozen_s
-            and self.current != 0.0
-            and fabs(self.motor - self.frozen_from) > FROZEN
-        ):
+        if self.frozen_s >= self.longest_frozen_s and self.current != 0.0 and fabs(self.motor - self.frozen_from) > FROZEN:
             faults |= CURRENT_FROZEN
         return faults
 
@@ -369,10 +360,10 @@ cdef double _too_long(Runs *r, bint equal, bint standing, double rare) noexcept 
 
 cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint standing) noexcept nogil:
     """Take a sample; set `doubt`, what the torsion may be off by [Nm], in the same cycle."""
-    cdef double dt = x.dt_s, current = law.current * x.current_a
+    cdef double dt = x.dt_s, current = law.current * x.current_a, slipped = 0.0
     cdef double expected = law.motor * x.motor_velocity_rad_s * dt, faster = expected - s.velocity
     cdef double motor = law.motor * x.motor_position_rad, link = law.link * x.link_position_rad
-    cdef double doubt, longer, off = s.motor.off + s.link.off, bend, other, step = motor - s.motor.last, slipped = 0.0
+    cdef double doubt, unseen, longer, off = s.motor.off + s.link.off, bend, other, step = motor - s.motor.last
     cdef bint equal, link_still = link == s.link.last, calm = in_order(s)
     if not s.going or not 0.0 < dt <= LONGEST_STEP_S or not isfinite(motor + link + expected + current):
         s.going = isfinite(motor + link + expected + current)
@@ -399,10 +390,8 @@ cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint
         )
     doubt = max(doubt, _channel(&s.link, link, expected, faster, law.acceleration, dt, calm, &other))
     if link_still:
-        doubt = max(
-            doubt,
-            fabs(current - s.still_nm) * min((s.link_runs.still + 1) * dt * FOLLOW_RATE, 1.0) - COUNTS * s.link.quantum,
-        )
+        unseen = fabs(current - s.still_nm) * min((s.link_runs.still + 1) * dt * FOLLOW_RATE, 1.0)
+        doubt = max(doubt, unseen - COUNTS * s.link.quantum)
     doubt = max(doubt - law.tolerance, slipped)
     # an encoder whose noise is below a count changes or stands still as its angle happens to lie
     standing = standing and s.link.noise > s.link.quantum * s.link.quantum
@@ -517,13 +506,9 @@ cdef int fill_contact(ContactLaw *law, double threshold_nm, double period_s) exc
 
 
 cdef void restart_contact(ContactState *s) noexcept nogil:
-    cdef int k
     s.samples = s.missed = s.active = s.blank = s.at = 0
-    for k in range(CONTACT_WAVES):
-        s.wave[k] = 0.0
-    s.last = 0.0
-    s.residual_nm = NAN
-    s.code = CONTACT_UNKNOWN
+    memset(s.wave, 0, sizeof(s.wave))
+    s.last, s.residual_nm, s.code = 0.0, NAN, CONTACT_UNKNOWN
 
 
 cdef void detect_contact(const ContactLaw *law, ContactState *s, double external_nm, double angle) noexcept nogil:
