@@ -19,10 +19,11 @@ Noise does not come twice. What has the probability q came 1/q samples ago, in t
 that equal those of `lag` samples ago, n samples after the nearest equal one each, chance has the probability 1/product(n) at most:
 
     sum(log n) > RARE + log(lag)              within its lag, where a position has changed: the current alone may have a limit cycle
-    sum(log n) + alone > RARE_WHOLE + log(lag)    where it ends after its lag: no limit cycle; alone: samples with n = lag
+    2 sum(log(lag/c)) - log(lag!/prod(c!)) > RARE_WHOLE + log(lag)      where it ends after its lag: no limit cycle
 
-No evidence is a sample that goes on with a shorter period. Enough is a run of AFTER_A_JUMP, alone, that begins with a jump of the
-motor: abs(slip) > JUMPS times the largest of SLIP_S, 2.4 times in 280 000 samples. At rest chance exceeds RARE once in three years.
+c: how often each sample is in a period; no probabilities make such a period, and it again, likelier than c/lag (Gibbs). No evidence
+is a sample that goes on with a shorter period. Enough is a run of AFTER_A_JUMP, alone, that begins with a jump of the motor:
+abs(slip) > JUMPS times the largest of SLIP_S, 2.4 times in 280 000 samples. At rest chance exceeds RARE once in three years.
 Nothing is concluded from a value that stands still beside others that stand still: a joint at rest is no fault. The limit of
 the twist is what twice the largest believable torque does to the gear, and `twist_rad` for encoder errors: the
 reference is the first sample, whose own torque is not known. It stays, over gaps too, until `reset()`.
@@ -98,7 +99,7 @@ cdef double LONGEST_STEP_S = 0.05  # differences over a longer step are not judg
 cdef double GAP_PERIODS = 5.0  # a longer step is a gap: its slip is acceleration that was not measured, and is not added up
 cdef int MOTOR_JUMP = st.MOTOR_JUMP, LINK_JUMP = st.LINK_JUMP, VELOCITY_MISMATCH = st.VELOCITY_MISMATCH
 cdef int TORSION = st.TORSION, CURRENT_FROZEN = st.CURRENT_FROZEN, REPEATED = st.REPEATED
-cdef double RARE = 24.0, RARE_WHOLE = 20.0, AFTER_A_JUMP = 3.0  # evidence that chance has once in years of rest; samples
+cdef double RARE = 24.0, RARE_WHOLE = 20.5, AFTER_A_JUMP = 3.0  # evidence that chance has once in years of rest; samples
 cdef double JUMPS = 4.0, SLIP_S = 0.05, LEAST_SLIP = 1e-3  # ratio; [s]; [rad], of a channel without noise
 cdef uint64_t ODD = 0x9E3779B97F4A7C15
 cdef double LOG[256]
@@ -110,6 +111,19 @@ cdef inline uint64_t _mixed(uint64_t word, double value) noexcept nogil:
     memcpy(&bits, &value, sizeof(bits))
     word = (word ^ bits) * ODD
     return word ^ word >> 29
+
+
+cdef double _twice(const Samples *s, uint8_t lag) noexcept nogil:
+    """Return the evidence of a period of `lag` samples and the same again, whose last one is not stored yet."""
+    cdef double evidence = -LOG[lag]
+    cdef int i, j, count, before, end = s.next - 2
+    for i in range(lag):
+        count = before = 0
+        for j in range(lag):
+            if s.words[<uint8_t> (end - i)] == s.words[<uint8_t> (end - j)]:
+                count, before = count + 1, before + (j <= i)
+        evidence += 2.0 * (LOG[lag] - LOG[count]) - LOG[i + 1] + LOG[before]
+    return evidence
 
 
 cdef bint _repeats(Samples *s, uint64_t word, bint jumped, bint still) noexcept nogil:
@@ -130,7 +144,9 @@ cdef bint _repeats(Samples *s, uint64_t word, bint jumped, bint still) noexcept 
             if not periodic:
                 run.evidence, run.alone = run.evidence + LOG[nearest], run.alone + (nearest == lag)
                 repeats |= (run.evidence > RARE and s.still < length) or (run.alone >= AFTER_A_JUMP and s.since == length - 1)
-            if lag <= length < 2 * lag and run.evidence + run.alone > RARE_WHOLE:
+                if length == lag > 7:  # a shorter one has less than RARE_WHOLE, whatever its samples
+                    run.evidence = _twice(s, lag)
+            if lag <= length < 2 * lag and run.evidence > RARE_WHOLE:
                 s.whole = lag
         before, lag, at = lag, k - s.older[at], s.older[at]
     s.words[k], s.older[k], s.at[slot] = word, s.at[slot], k

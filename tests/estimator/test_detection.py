@@ -178,6 +178,18 @@ def test_at_rest_data_that_turn_a_few_cycles_old_are_found(delay: int, counts: f
     assert np.mean(found) >= 0.9
 
 
+@pytest.mark.parametrize(("values", "delay"), [(6, 16), (8, 14), (10, 12)])
+def test_data_that_turn_old_are_found_where_each_sample_comes_often(values: int, delay: int) -> None:
+    """The chance of a period and the same again, not of each sample by when it came last."""
+    draw, found = np.random.default_rng(values), []
+    for _ in range(100):
+        check = checks()
+        angles = [1e-5 * which for which in draw.integers(0, values, 300).tolist()]
+        late = [*angles[:250], *angles[250 - delay :]]
+        found.append(any(check.step(PERIOD_S, angle, 0.0, 1e-2 * angle, 0.0) for angle in late))
+    assert np.mean(found) >= 0.9
+
+
 @pytest.mark.parametrize("values", [2, 3, 5, 8, 30])
 def test_a_joint_that_stops_where_it_has_few_values_is_not_old(values: int) -> None:
     """10 000 stops, each with values that have never come before: their first repetitions prove nothing."""
