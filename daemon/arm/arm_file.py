@@ -1,7 +1,7 @@
 """ARM.yaml: which joint of which running jtqd is which joint of a URDF, and what is known of the arm; frozen values.
 
     urdf: arm.urdf                # beside this file
-    tool: flange                  # a frame of the URDF
+    tool: flange                  # a link of the URDF
     joints:                       # of the URDF; all others stand at zero
       shoulder: {bus: can0, joint: 1, direction: 1, zero_rad: 0.0132}
       elbow: {bus: can0, joint: 2, direction: -1, zero_rad: -1.5708}
@@ -104,8 +104,11 @@ class ArmFile:
         """Yield key, value and expectation of each mistake."""
         if not self.joints:
             yield "joints", Verbatim("none"), "joints of the URDF with bus, joint, direction and zero_rad"
-        if not any(self.up):
+        if max(map(abs, self.up)) < 1e-3:
             yield "up", list(self.up), "a direction: 3 numbers that are not all 0"
+        for name in self.joints:
+            if not (name.isprintable() and name.strip()):
+                yield "joints", name, "names of printable characters"
         users: dict[tuple[str, int], str] = {}
         for name, each in self.joints.items():
             user = users.setdefault((each.bus, each.joint), name)

@@ -150,8 +150,8 @@ class Detector:
         return np.asarray(self.smooth[1] - self.reference)
 
     def _goes_on(self, weight: Array, belief: Array, freedom: int) -> bool:
-        if not freedom:
-            return True
+        if not freedom:  # it goes on when something is known again, or ends
+            return False
         weights = self.certain[1] * weight
         level = _beyond_by(self.smooth[1], weights, belief[2])
         much = level > self.limits[freedom]

@@ -22,9 +22,12 @@ CONDITIONED: Final = 30.0
 """A wrench is published where the pose makes no way of pushing so many times less certain than another."""
 SCALE_M: Final = 0.25
 """Torques of a wrench count as forces at this distance."""
+FASTEST_RAD_S: Final = 50.0
+"""A position that has gone farther in a cycle has gone nowhere: it has another zero, or lacks a turn."""
 PLACES_S: Final = 0.02
 WRENCH_S: Final = 0.005
 """Between two poses at which the wrench's matrix is computed."""
+NOWHERE: Final = Place(0, np.full(3, np.nan), np.nan, np.full(3, np.nan))
 
 
 class ArmEstimate(NamedTuple):
@@ -84,6 +87,7 @@ class ArmEstimator:
         self.to_wrench, self.wrench_sigma = np.full((6, model.n), np.nan), np.full(6, np.nan)
         self.cycle = -1
         n = model.n
+        self.position = np.full(n, np.nan)
         self.filtered = Filtered(n, period_s)
         self.motion = motion_gains(period_s)[:, None, None]
         self.shaken = np.zeros(n)
@@ -109,14 +113,20 @@ class ArmEstimator:
     def step(self, position_rad: Array, torque_nm: Array, sigma_nm: Array) -> ArmEstimate:
         """Take positions, drive-side torques and their sigmas [n] of one cycle (NaN: none); return what is known after it.
 
-        A position that is missing makes everything missing; the filter starts again with the next.
+        A position that is missing, or jumps, makes everything missing; the filter starts again with the next. A torque
+        counts with a sigma that is > 0.
         """
         self.cycle += 1
         model = self.model
-        if not math.isfinite(position_rad.sum()):
+        before, self.position = self.position, position_rad
+        farthest = FASTEST_RAD_S * self.period_s
+        if not math.isfinite(position_rad.sum()) or (np.abs(position_rad - before) > farthest).any():
             self.filtered = Filtered(model.n, self.period_s)
             self.detector.forget()
             return self._nothing()
+        known = (sigma_nm > 1e-9) & (sigma_nm < 1e9)
+        if not known.all():
+            torque_nm, sigma_nm = np.where(known, torque_nm, np.nan), np.where(known, sigma_nm, np.nan)
         self.filtered.add(position_rad, torque_nm)
         q, v, a = self.filtered.motion()
         raw = model.torque(q, v, a) - self.filtered.torques()
@@ -142,7 +152,7 @@ class ArmEstimator:
         if self.cycle % self.wrenching == 0 or others:
             model.place(q)
             wrench = self._solve_wrench(residual, spread)
-        found = self.found
+        found = NOWHERE if self.found is None else self.found
         return ArmEstimate(
             residual,
             np.sqrt(spread),
@@ -152,11 +162,11 @@ class ArmEstimator:
             belief.payload.mass_kg,
             belief.sigma_kg,
             self.centre,
-            0 if found is None else found.link,
-            np.nan if found is None else float(np.linalg.norm(found.force_n)),
+            found.link,
+            float(np.linalg.norm(found.force_n)),
             self.detector.since,
-            np.full(3, np.nan) if found is None else found.point_m,
-            np.nan if found is None else found.point_sigma_m,
+            found.point_m,
+            found.point_sigma_m,
         )
 
     def _believe(self, payload: Array, inertia: Array) -> None:
@@ -224,20 +234,6 @@ class ArmEstimator:
         return contact
 
     def _nothing(self) -> ArmEstimate:
-        n, nan = self.model.n, float("nan")
-        three = np.full(3, nan)
-        return ArmEstimate(
-            np.full(n, nan),
-            np.full(n, nan),
-            np.full(6, nan),
-            np.full(6, nan),
-            nan,
-            nan,
-            nan,
-            three,
-            0,
-            nan,
-            -1,
-            three,
-            nan,
-        )
+        nan = math.nan
+        joints, six, three = (np.full(count, nan) for count in (self.model.n, 6, 3))
+        return ArmEstimate(joints, joints, six, six, nan, nan, nan, three, 0, nan, -1, three, nan)

@@ -141,16 +141,8 @@ class ArmMessages:
             estimate.sigma_nm.tobytes() + estimate.wrench_sigma.tobytes() + _double(estimate.conditioning)
         )
         status = shown_status(aligned, estimate).tobytes()
-        add(
-            self._every,
-            self._names,
-            _index(cycle, aligned.instant_ns),
-            position,
-            torques,
-            external,
-            sigmas,
-            status,
-        )
+        index = _index(cycle, aligned.instant_ns)
+        add(self._every, self._names, index, position, torques, external, sigmas, status)
         add(WRENCH, self._links[0], estimate.wrench.tobytes())
         sample, slow = aligned.instant_ns // _SAMPLE_NS, aligned.instant_ns // _SLOW_NS
         sampled, self._sample = sample != self._sample, sample
@@ -158,11 +150,8 @@ class ArmMessages:
         if shown:
             link = self._touched = estimate.contact
             since_ns = time_ns - (cycle - estimate.since_cycle) * self._period_ns if link else 0
-            numbers = (
-                _double(estimate.strength_n),
-                estimate.point_m.tobytes(),
-                _double(estimate.point_sigma_m),
-            )
+            strength, off = _double(estimate.strength_n), _double(estimate.point_sigma_m)
+            numbers = strength, estimate.point_m.tobytes(), off
             add(CONTACT, self._links[link], *numbers, _stamp(since_ns), bytes([link]))
         if sampled:
             add(JOINT_STATES, self._state[0], position, self._state[1], external)

@@ -14,7 +14,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.decoder import numbers_text
+from jtqd.estimator.errors import ConfigError, shown
 
 Array = np.ndarray
 G: Final = 9.81
@@ -22,6 +23,19 @@ INERTIAL: Final = 10
 """Parameters of a rigid body: m, m c (3), inertia about its frame's origin (xx, xy, yy, xz, yz, zz)."""
 POINT_M: Final = 0.045
 """Distance of the points that stand for a surface."""
+_NUMBERS: Final = (
+    (".", "axis", "xyz", 3, -1e3, 1e3),
+    (".", "origin", "xyz rpy", 3, -10.0, 10.0),
+    ("inertial", "origin", "xyz rpy", 3, -10.0, 10.0),
+    ("inertial", "mass", "value", 1, 0.0, 1e4),
+    ("inertial", "inertia", "ixx iyy izz", 1, 0.0, 1e4),
+    ("inertial", "inertia", "ixy ixz iyz", 1, -1e4, 1e4),
+    ("collision", "origin", "xyz rpy", 3, -10.0, 10.0),
+    ("collision/geometry", "cylinder", "radius length", 1, 0.0, 3.0),
+    ("collision/geometry", "sphere", "radius", 1, 0.0, 3.0),
+    ("collision/geometry", "box", "size", 3, 0.0, 3.0),
+)
+"""Of joints and links: element, attributes, how many numbers, from, to (kg, m, rad); a size in mm is beyond."""
 
 
 class Payload(NamedTuple):
@@ -42,7 +56,7 @@ class Surface(NamedTuple):
 class ArmModel:
     """Raises ConfigError, which names the URDF and what does not fit.
 
-    urdf: the file's text. joints: names of the joints that move; all others stand at zero. tool: a frame of the URDF.
+    urdf: the file's text. joints: names of the joints that move; all others stand at zero. tool: a link of the URDF.
     up: the direction that is up, in base axes.
     """
 
@@ -56,15 +70,21 @@ class ArmModel:
         name: str = "URDF",
     ) -> None:
         self.root = _parsed(urdf, name)
-        every = pin.buildModelFromXML(ET.tostring(self.root, encoding="unicode"))
+        try:
+            every = pin.buildModelFromXML(ET.tostring(self.root, encoding="unicode"))
+        except (ValueError, RecursionError) as error:  # of pinocchio; why, its parser has printed
+            raise ConfigError(f"{name}: {error}") from None
         known = list(every.names)[1:]
         for joint in joints:
             if joint not in known:
                 raise ConfigError(
                     f"{name}: found no moving joint {joint}, expected one of {', '.join(known)}"
                 )
-        if not every.existFrame(tool):
-            raise ConfigError(f"{name}: found no frame {tool} (tool)")
+        for each in self.root.findall("joint"):
+            leader = "" if (mimic := each.find("mimic")) is None else mimic.get("joint", "")
+            if leader in joints and each.get("name") not in joints:
+                found = f"joint {each.get('name')} follows {leader} (mimic)"
+                raise ConfigError(f"{name}: found {found}, expected it in joints, with an encoder of its own")
         locked = [every.getJointId(joint) for joint in known if joint not in joints]
         model = pin.buildReducedModel(every, locked, pin.neutral(every))
         for joint in list(model.names)[1:]:
@@ -80,9 +100,11 @@ class ArmModel:
         for k, joint in enumerate(self.joints, start=1):
             if sum(each.mass for each in list(model.inertias)[k:]) <= 0.0:
                 raise ConfigError(f"{name}: what moves with joint {joint} has no mass")
-        frame = model.frames[model.getFrameId(tool)]
+        if not self.moves(tool):
+            raise ConfigError(f"{name}: found no link {tool} that moves with a joint, expected it for tool")
+        self._tool = model.getFrameId(tool, pin.FrameType.BODY)
+        frame = model.frames[self._tool]
         self.tool_joint, self.tool_place = frame.parentJoint, frame.placement
-        self._tool = model.getFrameId(tool)
         self._bare = [pin.Inertia(each) for each in model.inertias]
         self.data = model.createData()
         self.payload_columns = self._payload_columns()
@@ -90,7 +112,9 @@ class ArmModel:
 
     def moves(self, link: str) -> bool:
         """Return whether a link of the URDF moves with a joint."""
-        return bool(self.pin.existFrame(link) and self.pin.frames[self.pin.getFrameId(link)].parentJoint > 0)
+        body = link, pin.FrameType.BODY
+        there = self.pin.existFrame(*body)
+        return bool(there and self.pin.frames[self.pin.getFrameId(*body)].parentJoint > 0)
 
     # ---- what hangs on it ----
 
@@ -141,7 +165,7 @@ class ArmModel:
 
     def regressor(self, q: Array, v: Array, a: Array) -> Array:
         """Return the torque's derivatives [n, 10 n] by the links' inertial parameters (Atkeson, An, Hollerbach 1986)."""
-        return np.asarray(pin.computeJointTorqueRegressor(self.pin, self.data, q, v, a))
+        return np.reshape(pin.computeJointTorqueRegressor(self.pin, self.data, q, v, a), (self.n, -1))
 
     def of_payload(self, q: Array, v: Array, a: Array) -> Array:
         """Return the torque's derivatives [n, 4] by mass and m c of the payload."""
@@ -183,7 +207,7 @@ class ArmModel:
             name = link.get("name", "")
             if not self.moves(name):
                 continue
-            frame = self.pin.frames[self.pin.getFrameId(name)]
+            frame = self.pin.frames[self.pin.getFrameId(name, pin.FrameType.BODY)]
             for shape in link.iter("collision"):
                 solid = _solid(shape, frame.placement)
                 if solid is not None:
@@ -290,6 +314,21 @@ def _numbers(element: ET.Element | None, key: str) -> Array:
     return np.array([float(word) for word in text.split()])
 
 
+def _check(owner: ET.Element, where: str) -> None:  # of a link with such numbers pinocchio takes one half
+    for path, child, keys, count, least, most in _NUMBERS:
+        for parent in owner.findall(path):
+            each = parent.find(child)
+            for key in keys.split() if each is not None or child in ("mass", "inertia") else ():
+                text = "" if each is None else each.get(key, "0 0 0" if child == "origin" else "")
+                try:
+                    good = [least <= float(word) <= most for word in text.split()] == [True] * count
+                except ValueError:
+                    good = False
+                if not good:
+                    expected = f"{numbers_text(count)} from {least:g} to {most:g}"
+                    raise ConfigError(f"{where}: {child} {key}: found {shown(text)}, expected {expected}")
+
+
 def _parsed(urdf: str, name: str) -> ET.Element:
     """Return the URDF; joints without limits of angle become revolute ones. Raises ConfigError."""
     try:
@@ -298,7 +337,12 @@ def _parsed(urdf: str, name: str) -> ET.Element:
         raise ConfigError(f"{name}: found no XML: {error}") from None
     if root.tag != "robot":
         raise ConfigError(f"{name}: found <{root.tag}>, expected <robot>")
-    for joint in root.iter("joint"):
+    for owner in (*root.findall("joint"), *root.findall("link")):
+        _check(owner, f"{name}: {owner.tag} {owner.get('name')}")
+    for joint in root.findall("joint"):
+        turns = joint.get("type") in ("revolute", "continuous")
+        if turns and (axis := joint.find("axis")) is not None and not _numbers(axis, "xyz").any():
+            raise ConfigError(f"{name}: joint {joint.get('name')}: found axis 0 0 0, expected a direction")
         if joint.get("type") == "continuous":
             joint.set("type", "revolute")
             limit = joint.find("limit")

@@ -160,12 +160,7 @@ class Arm:
     def __init__(self, config: ArmConfig) -> None:
         file = config.file
         urdf = str(config.urdf_path)
-        try:
-            self.model = ArmModel(config.urdf, [*file.joints], file.tool, up=file.up, name=urdf)
-        except ConfigError:
-            raise
-        except ValueError as error:  # of pinocchio; why, its parser has printed
-            raise ConfigError(f"{urdf}: {error}") from None
+        self.model = ArmModel(config.urdf, [*file.joints], file.tool, up=file.up, name=urdf)
         self._file = file
         buses = dict.fromkeys(each.bus for each in file.joints.values())
         self._sources = [Source(bus, {k: v for k, v in file.joints.items() if v.bus == bus}) for bus in buses]

@@ -12,6 +12,7 @@ import pytest
 from jtqd.daemon.arm.estimator import ArmEstimate, ArmEstimator, ArmNoise
 from jtqd.daemon.arm.model import ArmModel, Payload
 from jtqd.estimator.errors import ConfigError
+from tests.daemon.arm import small_arm
 from tests.daemon.arm.panda import JOINTS, PERIOD_S, Motion, Push, model_text, moved, new_model
 from validation.arm.arm import TOOL, rigid
 from validation.arm.arm import Payload as TruePayload
@@ -268,3 +269,68 @@ def test_a_urdf_that_does_not_fit_is_refused_in_one_line(
         ArmModel(change(model_text()), JOINTS, TOOL)
     assert "\n" not in str(error.value)
     assert all(word in str(error.value) for word in words)
+
+
+def small_runs(
+    joints: list[str], change: Callable[[int, np.ndarray, np.ndarray, np.ndarray], None]
+) -> list[ArmEstimate]:
+    """Estimates of the small arm, or of a part of it, in motion."""
+    model = ArmModel(small_arm.URDF, joints, "flange")
+    estimator, n = ArmEstimator(model, PERIOD_S, payload=Payload()), len(joints)
+    rate, made = 1.0 + np.arange(n), []
+    for k in range(1200):
+        phase = rate * PERIOD_S * k
+        q, v, a = 0.5 * np.sin(phase), 0.5 * rate * np.cos(phase), -0.5 * rate**2 * np.sin(phase)
+        torque, sigma = model.torque(q, v, a), np.full(n, 0.4)
+        change(k, q, torque, sigma)
+        made.append(estimator.step(q, torque, sigma))
+    return made
+
+
+def test_an_arm_of_one_joint_has_an_external_torque_and_no_wrench() -> None:
+    def pushed(k: int, position: np.ndarray, torque: np.ndarray, sigma: np.ndarray) -> None:
+        torque -= 8.0 * (k >= 800)
+
+    made = small_runs(["shoulder"], pushed)
+    assert abs(made[700].external_nm[0]) < 0.05
+    assert made[900].external_nm == pytest.approx([8.0], abs=0.05)
+    assert made[900].contact == 1
+    assert not stacked(made[:800], "contact").any()
+    assert np.isnan(made[900].wrench).all()
+    assert made[900].conditioning == np.inf
+
+
+def test_a_position_that_lacks_a_turn_pushes_nothing() -> None:
+    def turned(k: int, position: np.ndarray, torque: np.ndarray, sigma: np.ndarray) -> None:
+        position[0] -= 2.0 * np.pi * (k >= 600)
+
+    made = small_runs(["shoulder", "elbow"], turned)
+    external = stacked(made, "external_nm")
+    assert np.nanmax(np.abs(external)) < 0.05
+    assert np.isnan(external[600:640]).all()
+    assert np.isfinite(external[700:]).all()
+    assert not stacked(made, "contact").any()
+
+
+@pytest.mark.parametrize("value", [0.0, -0.4, 5e-324, np.inf, np.nan])
+def test_a_torque_without_a_sigma_that_can_be_is_none(value: float) -> None:
+    def without(k: int, position: np.ndarray, torque: np.ndarray, sigma: np.ndarray) -> None:
+        if k >= 600:
+            sigma[0] = value
+
+    made = small_runs(["shoulder", "elbow"], without)
+    assert np.isnan(made[-1].external_nm[0])
+    assert np.isnan(made[-1].sigma_nm[0])
+    assert abs(made[-1].external_nm[1]) < 0.05
+    assert not stacked(made, "contact").any()
+
+
+def test_without_any_torque_no_contact_is_told() -> None:
+    def lost(k: int, position: np.ndarray, torque: np.ndarray, sigma: np.ndarray) -> None:
+        torque -= 8.0 * (k >= 600)
+        torque += np.nan if 800 <= k < 1000 else 0.0
+
+    contact = stacked(small_runs(["shoulder", "elbow"], lost), "contact")
+    assert contact[700:800].all()
+    assert not contact[800:1000].any()
+    assert contact[1100:].all()

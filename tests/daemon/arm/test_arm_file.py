@@ -58,6 +58,7 @@ def test_what_may_be_left_out(tmp_path: Path) -> None:
     assert (config.file.up, config.file.payload, config.file.noise) == ((0.0, 0.0, 1.0), None, None)
 
 
+SOURCE = {"bus": "vcan2", "joint": 1, "direction": 1, "zero_rad": 0.0}
 MISTAKES = [
     ("urdf", None, "key 'urdf'", "missing", "a text"),
     ("urdf", "other.urdf", "other.urdf", "No such file", ""),
@@ -83,6 +84,9 @@ MISTAKES = [
     ("joints.elbow.bus", "vcan0", "key 'joints.elbow.joint'", "found 1", "vcan0 that is not shoulder"),
     ("up", [0, 0], "key 'up'", "found 2 numbers", "3 finite numbers"),
     ("up", [0, 0, 0], "key 'up'", "found [0", "not all 0"),
+    ("up", [1e-320, 0, 0], "key 'up'", "found [1e-320", "not all 0"),
+    ("joints.el\tbow", SOURCE, "key 'joints'", "found 'el\\tbow'", "printable"),
+    ("joints. ", SOURCE, "key 'joints'", "found ' '", "printable"),
     ("payload.mass_kg", -1.0, "key 'payload.mass_kg'", "found -1.0", "in kg from 0 to 1000"),
     ("payload.centre_m", [0, 10, 100], "key 'payload.centre_m'", "found [0", "in m from -2 to 2"),
     ("noise.total.elbow", None, "key 'noise.total.elbow'", "missing", "a value"),

@@ -178,12 +178,33 @@ def test_a_joint_that_its_jtqd_does_not_have_ends_it_in_one_line(tmp_path: Path)
         assert part in line
 
 
+def touchable(shape: str) -> str:
+    """URDF with a shape of its links."""
+    return small_arm.URDF.replace(
+        "<inertial>", f"<collision><geometry>{shape}</geometry></collision><inertial>"
+    )
+
+
 @pytest.mark.parametrize(
     ("urdf", "tool", "expected"),
     [
         ("<robot", "flange", "no XML"),
         ("<arm/>", "flange", "expected <robot>"),
-        (small_arm.URDF, "hand", "found no frame hand"),
+        (small_arm.URDF, "hand", "found no link hand that moves"),
+        (small_arm.URDF, "base", "found no link base that moves"),
+        (small_arm.URDF, "universe", "found no link universe that moves"),
+        (small_arm.URDF.replace('"0 -1 0"', '"0 0 0"'), "flange", "joint shoulder: found axis 0 0 0"),
+        (
+            small_arm.URDF.replace("2.0", "2,0", 1),
+            "flange",
+            "link upper: mass value: found '2,0', expected 1",
+        ),
+        (small_arm.URDF.replace("2.0", "-2", 1), "flange", "link upper: mass value: found '-2', expected 1"),
+        (small_arm.URDF.replace("0.001", "nan", 1), "flange", "link upper: inertia ixx: found 'nan'"),
+        (touchable('<cylinder radius="0.1"/>'), "flange", "link upper: cylinder length: found ''"),
+        (touchable('<cylinder radius="60" length="300"/>'), "flange", "expected 1 number from 0 to 3"),
+        (touchable('<box size="1 2"/>'), "flange", "box size: found '1 2', expected 3 numbers"),
+        ("<robot>" + 10**5 * "<x>" + 10**5 * "</x>" + "</robot>", "flange", "recursion"),
         (small_arm.URDF.replace('"elbow"', '"elbows"'), "flange", "found no moving joint elbow"),
         (small_arm.URDF.replace('<parent link="base"/>', ""), "flange", "not contain a valid URDF"),
     ],
@@ -197,6 +218,18 @@ def test_a_urdf_that_does_not_fit_is_one_line(
     assert expected in lines[-1]
     assert sum(line.startswith("jtqd-arm: ") for line in lines) == 1
     assert not [line for line in lines if "Traceback" in line]
+
+
+def test_a_joint_that_follows_one_of_the_arm_is_not_taken_as_standing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begins = small_arm.URDF.index('name="elbow" type')
+    follower = small_arm.URDF[begins:].replace("<axis", '<mimic joint="shoulder"/><axis', 1)
+    urdf = small_arm.URDF[:begins] + follower
+    joints = {"shoulder": {"bus": "none", "joint": 1, "direction": 1, "zero_rad": 0.0}}
+    path = small_arm.write(tmp_path, small_arm.content(joints=joints), urdf)
+    assert main([str(path), "--duration", "1"]) == 2
+    assert "found joint elbow follows shoulder" in capsys.readouterr().err
 
 
 def test_without_pinocchio_it_names_the_extra(
