@@ -85,9 +85,12 @@ def fit_arm(
 def _runs(path: Path, model: ArmModel, payload: Payload) -> list[FreeMotion]:
     """Return the parts of a log without gaps. Raises OneLineError."""
     table = read_topic(path, _TOPIC)
-    names = tuple(bytes(table["joints"][0]).decode("utf-8", "replace").split())
-    if names != model.joints:
-        raise ConfigError(f"{path}: found joints {', '.join(names)}, expected {', '.join(model.joints)}")
+    names, expected = (
+        bytes(table["joints"][0]).decode("utf-8", "replace").rstrip("\0"),
+        " ".join(model.joints),
+    )
+    if names != expected:
+        raise ConfigError(f"{path}: found joints {names}, expected {expected}")
     time_ns = np.asarray(table["monotonic_ns"], np.int64)
     position = np.asarray(table["position_rad"], float)
     torque, sigma = np.asarray(table["torque_nm"], float), np.asarray(table["torque_sigma_nm"], float)
@@ -173,7 +176,7 @@ def _noise(model: ArmModel, noise: ArmNoise) -> dict[str, Any]:
 def _urdf(model: ArmModel, inertial: Array, comment: str) -> str:
     """Return the URDF with these parameters of the links that move; links fixed to them have no inertia of their own."""
     root = model.root
-    child = {each.get("name"): str(each.find("child").get("link")) for each in root.iter("joint")}  # type: ignore[union-attr]
+    child = {each.get("name"): str(each.find("child").get("link")) for each in root.findall("joint")}  # type: ignore[union-attr]
     links = {child[joint]: theta for joint, theta in zip(model.joints, inertial, strict=True)}
     for link in root.iter("link"):
         name = link.get("name", "")

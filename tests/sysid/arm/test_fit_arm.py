@@ -28,7 +28,9 @@ HEAVY = TruePayload(2.0, (0.01, -0.02, 0.06))
 
 
 def arm_file(folder: Path) -> Path:
-    (folder / "panda.urdf").write_text(model_text())
+    # as most of others do, it has transmissions, whose joints have no link
+    wired = '<transmission name="t"><joint name="panda_joint1"/></transmission></robot>'
+    (folder / "panda.urdf").write_text(model_text().replace("</robot>", wired))
     joints = {
         name: {"bus": "can0", "joint": k % 4 + 1, "direction": 1, "zero_rad": 0.0}
         for k, name in enumerate(JOINTS)
