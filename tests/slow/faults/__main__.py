@@ -16,7 +16,7 @@ from tests.slow.faults.runs import PLANTS, STATES
 from tests.slow.faults.table import CASES_PER_ROW, PAIRS, pairs, singles
 from tests.slow.faults.trial import Baseline, Case, Outcome, baseline, judge
 
-SEED: Final = 46219
+SEED: Final = 57731
 """Of the table in docs/safety.md: nothing is chosen on it."""
 BASELINE_SEEDS: Final = 3
 PAGE: Final = ROOT / "docs" / "safety.md"
