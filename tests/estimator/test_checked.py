@@ -15,6 +15,8 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.text import counted
 
 ROOT = Path(__file__).parents[2]
+IMPORTED = {"pin": "pinocchio"}
+"""Packages that are imported by another name."""
 
 
 def test_one_thing_has_no_plural() -> None:
@@ -73,7 +75,7 @@ def test_packages_that_are_missing_are_named_with_the_extra_that_brings_them(
 def test_every_extra_that_is_asked_for_brings_what_is_asked_of_it() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = {
-        name: {re.split(r"\W", line)[0] for line in lines}
+        name: {IMPORTED.get(package, package) for package in (re.split(r"\W", line)[0] for line in lines)}
         for name, lines in project["optional-dependencies"].items()
     }
     asked = [
