@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import shlex
 import sys
 from collections.abc import Sequence
@@ -54,9 +53,13 @@ def main(argv: list[str]) -> int:
     except ConfigError as error:
         print(f"jtq fit arm: {error}", file=sys.stderr)
         return 2
+    from jtqd.daemon.arm.arm_file import load_arm
     from jtqd.sysid.arm.fit import fit_arm, lines, write
 
     try:
+        for path in (options.arm, load_arm(options.arm).urdf_path):
+            if path.resolve() in ((options.out / name).resolve() for name in ("arm.urdf", "arm.yaml")):
+                raise ConfigError(f"--out {options.out}: found {path} there, expected another directory")
         make_directory(options.out)
         config, model, result = fit_arm(options.arm, payloads)
         write(options.out, config, model, result, shlex.join(["jtq", "fit", *argv]))
@@ -77,8 +80,8 @@ def _payloads(words: Sequence[str], logs: Sequence[Path]) -> dict[Path, Hung]:
             mass, x, y, z = (float(each) for each in text.split(","))
         except ValueError:
             raise ConfigError(f"--payload: found {word!r}, expected LOG=KG,X,Y,Z") from None
-        if not (0.0 <= mass < math.inf and max(map(abs, (x, y, z))) <= 2.0):
-            raise ConfigError(f"--payload: found {word!r}, expected kg >= 0 and a centre within 2 m")
+        if not (0.0 <= mass <= 1000.0 and max(map(abs, (x, y, z))) <= 2.0):
+            raise ConfigError(f"--payload: found {word!r}, expected 0 to 1000 kg and a centre within 2 m")
         matching = [path for path in logs if name in (str(path), path.name)]
         if len(matching) != 1:
             raise ConfigError(f"--payload: found {name!r}, expected one of {', '.join(map(str, logs))}")

@@ -13,7 +13,7 @@ import yaml
 
 from jtqd import __version__
 from jtqd.daemon.arm.arm_file import ArmConfig, load_arm
-from jtqd.daemon.arm.estimator import ArmNoise
+from jtqd.daemon.arm.estimator import FASTEST_RAD_S, ArmNoise
 from jtqd.daemon.arm.model import INERTIAL, ArmModel, Array, Payload
 from jtqd.daemon.logs.read import read_topic
 from jtqd.estimator.errors import ConfigError
@@ -32,6 +32,8 @@ from jtqd.sysid.arm.identification import (
 _TOPIC: Final = "/arm/external"
 _SHORTEST_S: Final = 5.0
 """Of a run without a gap: in a shorter one an offset and a slow error are not told from anything."""
+_LEAST_RAD: Final = 0.1
+"""Travel of the joint that moves most: noise at standstill is not that of motion."""
 _PARTS: Final = ("mass", *["centre"] * 3, *["inertia"] * 6)
 
 
@@ -59,11 +61,15 @@ def fit_arm(
     config = load_arm(path)
     file, urdf = config.file, str(config.urdf_path)
     model = ArmModel(config.urdf, [*file.joints], file.tool, up=file.up, name=urdf)
-    groups, logs = [], {}
+    groups, logs = [], dict[str, dict[str, Any]]()
     for log, (mass, *centre) in payloads.items():
         x, y, z = centre
         groups.append(_runs(log, model, Payload(mass, (x, y, z))))
-        logs[str(log)] = {"sha256": sha256_hex(read_file(log)), "payload": [mass, x, y, z]}
+        sha256 = sha256_hex(read_file(log))
+        twin = next((name for name, each in logs.items() if each["sha256"] == sha256), None)
+        if twin is not None:
+            raise ConfigError(f"{log}: found the same log as {twin}, expected one that holds it out")
+        logs[str(log)] = {"sha256": sha256, "payload": [mass, x, y, z]}
     normals = [[normal_of(model, run) for run in runs] for runs in groups]
     found = identify(model, [each for some in normals for each in some])
     held_out, better = None, True
@@ -85,27 +91,32 @@ def fit_arm(
 def _runs(path: Path, model: ArmModel, payload: Payload) -> list[FreeMotion]:
     """Return the parts of a log without gaps. Raises OneLineError."""
     table = read_topic(path, _TOPIC)
-    names, expected = (
-        bytes(table["joints"][0]).decode("utf-8", "replace").rstrip("\0"),
-        " ".join(model.joints),
-    )
+    names = bytes(table["joints"][0]).decode("utf-8", "replace").rstrip("\0")
+    expected = " ".join(model.joints)
     if names != expected:
         raise ConfigError(f"{path}: found joints {names}, expected {expected}")
     time_ns = np.asarray(table["monotonic_ns"], np.int64)
     position = np.asarray(table["position_rad"], float)
     torque, sigma = np.asarray(table["torque_nm"], float), np.asarray(table["torque_sigma_nm"], float)
+    torque = np.where((sigma > 0.0) & (sigma < np.inf), torque, np.nan)
     steps = np.diff(time_ns)
     period_ns = float(np.median(steps)) if len(steps) else 0.0
     there = np.isfinite(position).all(axis=1)
-    breaks = np.flatnonzero((np.abs(steps - period_ns) > 0.5 * period_ns) | (there[1:] != there[:-1])) + 1
+    jumps = (np.abs(np.diff(position, axis=0)) > 1e-9 * FASTEST_RAD_S * period_ns).any(axis=1)
+    gaps = (np.abs(steps - period_ns) > 0.5 * period_ns) | (there[1:] != there[:-1])
+    breaks = np.flatnonzero(gaps | jumps) + 1
     least = _SHORTEST_S * 1e9 / max(period_ns, 1.0)
     parts = [
-        part for part in np.split(np.arange(len(time_ns)), breaks) if len(part) >= least and there[part[0]]
+        part
+        for part in np.split(np.arange(len(time_ns)), breaks)
+        if len(part) >= least
+        and there[part[0]]
+        and np.isfinite(torque[part]).any(axis=0).all()
+        and np.ptp(position[part], axis=0).max() > _LEAST_RAD
     ]
     if not parts:
-        raise ConfigError(
-            f"{path}: found no {_SHORTEST_S:g} s with all positions, expected longer free motion"
-        )
+        found = f"no {_SHORTEST_S:g} s of motion with all positions and with torques of each joint"
+        raise ConfigError(f"{path}: found {found}, expected longer free motion")
     return [FreeMotion(1e-9 * period_ns, position[p], torque[p], sigma[p], payload) for p in parts]
 
 

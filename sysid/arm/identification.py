@@ -192,6 +192,8 @@ def noise_of(model: ArmModel, runs: Sequence[FreeMotion]) -> ArmNoise:
                 counts[row] += seen
         offsets.append(estimator.belief.mean[4:] / np.sqrt(np.maximum(estimator.belief.day, 1e-12)))
     root = np.sqrt(np.maximum(squares / np.maximum(counts, 1), LEAST**2))
+    unknown = ArmNoise.unknown(n)  # runs that are too short, or a joint whose torque is not in them
+    root = np.where(counts > 0, root, np.stack((unknown.total, *unknown.tests)))
     model.set_payload(Payload())
     return ArmNoise(root[0], float(np.sqrt(np.mean(np.square(offsets)))), root[1:], position)
 

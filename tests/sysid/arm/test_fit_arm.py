@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,12 +44,21 @@ def arm_file(folder: Path) -> Path:
 
 
 def log_of(
-    arm: Path, name: str, seed: int, payload: TruePayload, *, cycles: int = 12000, gap: int = 0
+    arm: Path,
+    name: str,
+    seed: int,
+    payload: TruePayload,
+    *,
+    cycles: int = 12000,
+    gap: int = 0,
+    still: bool = False,
+    sigma: float | None = None,
+    turn: float = 0.0,
 ) -> Path:
-    """Write free motion as jtqd-arm does; return the log."""
+    """Write free motion as jtqd-arm does; return the log. sigma: of joint 3; turn [rad]: of joint 1 from 6 s on."""
     config = load_arm(arm)
     factors, shifts = other_links()
-    motion = moved(cycles, payload=payload, seed=seed, factors=factors, shifts_m=shifts)
+    motion = moved(cycles, payload=payload, seed=seed, still=still, factors=factors, shifts_m=shifts)
     rng = np.random.default_rng([seed, 81])
     torque = motion.torque_nm + SIGMA * (
         0.3 * rng.normal(size=7) + 0.5 * rng.normal(size=motion.torque_nm.shape)
@@ -56,12 +66,14 @@ def log_of(
     model = ArmModel(config.urdf, [*config.file.joints], TOOL)
     messages, log = ArmMessages(model, TOOL, MS), ArmLog(config, arm.parent / name)
     nothing = ArmEstimator(model, 1e-3).step(np.full(7, np.nan), SIGMA, SIGMA)
-    status = np.full(7, VALID, np.uint8)
+    status, sigmas = np.full(7, VALID, np.uint8), SIGMA.copy()
+    sigmas[2] = SIGMA[2] if sigma is None else sigma
     for k in range(cycles):
         instant = 10**12 + (k + (gap if k > cycles // 2 else 0)) * MS
         position = motion.position_rad[k] + 1e-6 * rng.normal(size=7)
+        position[0] += turn * (k >= 6000)
         found = messages.of(
-            Aligned(instant, position, torque[k], SIGMA, status), nothing, k, 17 * 10**17 + instant
+            Aligned(instant, position, torque[k], sigmas, status), nothing, k, 17 * 10**17 + instant
         )
         log.add(found[0], instant)
     log.end()
@@ -137,7 +149,8 @@ def test_without_its_payload_a_log_makes_the_arm_worse_and_says_so(
     [
         (["--payload", "none.mcap=1,0,0,0"], ("none.mcap", "expected one of")),
         (["--payload", "{log}=1,0,0"], ("LOG=KG,X,Y,Z",)),
-        (["--payload", "{log}=-1,0,0,0"], ("kg >= 0",)),
+        (["--payload", "{log}=-1,0,0,0"], ("0 to 1000 kg",)),
+        (["--payload", "{log}=1e300,0,0,0"], ("0 to 1000 kg",)),
         (["--payload", "{log}=1,0,0,60"], ("2 m",)),
     ],
 )
@@ -177,3 +190,49 @@ def test_payload_of_the_fit_is_not_left_in_the_model(logs: tuple[Path, list[Path
     model.set_payload(Payload(2.0))
     model.set_payload(Payload())
     assert model.torque(np.full(7, 0.3), np.zeros(7), np.zeros(7)) == pytest.approx(bare)
+
+
+@pytest.mark.parametrize("options", [{"still": True}, {"sigma": 0.0}, {"sigma": np.inf}, {"sigma": np.nan}])
+def test_a_log_that_tells_nothing_is_refused(
+    logs: tuple[Path, list[Path]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    options: dict[str, Any],
+) -> None:
+    log = log_of(logs[0], tmp_path.name, 6, TruePayload(), cycles=6000, **options)
+    assert main(["fit", "arm", str(logs[0]), str(log), "--out", str(tmp_path)]) == 1
+    assert "no 5 s of motion" in capsys.readouterr().err
+    assert not (tmp_path / "arm.urdf").exists()
+
+
+def test_noise_that_runs_do_not_tell_is_that_before_any_fit(
+    logs: tuple[Path, list[Path]], tmp_path: Path
+) -> None:
+    log = log_of(logs[0], tmp_path.name, 7, TruePayload(), turn=2.0 * np.pi)  # two runs of 6 s
+    assert main(["fit", "arm", str(logs[0]), str(log), "--out", str(tmp_path)]) == 0
+    noise = load_arm(tmp_path / "arm.yaml").file.noise
+    assert noise is not None
+    assert set(noise.total.values()) == {1.5}
+    assert {*noise.tests.values()} == {(1.5, 1.5, 1.5)}
+
+
+def test_a_log_does_not_hold_out_itself(
+    logs: tuple[Path, list[Path]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arm, (empty, *_) = logs
+    twin = tmp_path / "twin.mcap"
+    twin.write_bytes(empty.read_bytes())
+    assert main(["fit", "arm", str(arm), str(empty), str(twin), "--out", str(tmp_path)]) == 1
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert f"{twin}: found the same log as {empty}" in line
+
+
+def test_files_of_the_arm_are_not_written_over(
+    logs: tuple[Path, list[Path]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    arm, (empty, *_) = logs
+    before = arm.read_bytes()
+    assert main(["fit", "arm", str(arm), str(empty), "--out", str(arm.parent)]) == 1
+    assert f"found {arm} there" in capsys.readouterr().err
+    assert arm.read_bytes() == before
