@@ -165,9 +165,8 @@ class Arm:
         buses = dict.fromkeys(each.bus for each in file.joints.values())
         self._sources = [Source(bus, {k: v for k, v in file.joints.items() if v.bus == bus}) for bus in buses]
         self._why = [""] * len(buses)
-        self._buses: list[Bus] = []
-        self.period_ns = 0
-        """Of the slowest bus; 0 as long as one was never there."""
+        self._buses, self._periods_ns = list[Bus](), list[int]()
+        """Of the buses; none as long as one was never there."""
         self.cycles = self.contacts = self._touched = 0
         self.estimated = np.zeros(self.model.n, int)
         self.payload_kg = self.payload_sigma_kg = math.nan
@@ -175,12 +174,15 @@ class Arm:
     def _begin(self, periods_ns: list[int]) -> None:
         """Build what depends on the periods of the buses [ns]."""
         noise, names = self._file.noise, self.model.joints
-        self.period_ns = max(periods_ns)
+        if self._buses:
+            warn(f"period {self._periods_ns} ns is {periods_ns} ns now: begins anew")
+        self._periods_ns, period_ns = periods_ns, max(periods_ns)
+        self.messages = ArmMessages(self.model, self._file.tool, period_ns)
         self._buses = [
             Bus({names.index(name): each for name, each in source.joints.items()}, period)
             for source, period in zip(self._sources, periods_ns, strict=True)
         ]
-        self._aligner = Aligner(self._buses, self.period_ns)
+        self._aligner = Aligner(self._buses, period_ns)
         known = payload = None
         if noise is not None:
             total, tests, position_rad = (
@@ -191,7 +193,7 @@ class Arm:
         if self._file.payload is not None:
             x, y, z = self._file.payload.centre_m
             payload = Payload(self._file.payload.mass_kg, (x, y, z))
-        self._estimator = ArmEstimator(self.model, 1e-9 * self.period_ns, known, payload)
+        self._estimator = ArmEstimator(self.model, 1e-9 * period_ns, known, payload)
 
     def new(self, now_ns: int) -> Iterator[tuple[Aligned, ArmEstimate, int]]:
         """Yield numbers, estimate and its cycle of what has become known. now_ns: CLOCK_MONOTONIC. Raises FieldError."""
@@ -200,11 +202,11 @@ class Arm:
             if source.why != self._why[n]:
                 self._why[n] = source.why
                 warn(f"waiting: {source.why}" if source.why else f"reading jtqd on {source.bus}")
+        found = [1000 * each.about.period_us for each in self._sources if each.about is not None]
+        if len(found) == len(self._sources) and found != self._periods_ns:
+            self._begin(found)
         if not self._buses:
-            found = [each.about for each in self._sources if each.about is not None]
-            if len(found) < len(self._sources):
-                return
-            self._begin([1000 * each.period_us for each in found])
+            return
         for bus, new in zip(self._buses, records, strict=True):
             bus.take(new)
         for aligned in self._aligner.ready(now_ns):
@@ -233,7 +235,7 @@ def run(
     config: ArmConfig, record: Path | None, live: Address | None, duration_s: float | None, stop: Stop
 ) -> dict[str, Any]:
     """Run until stopped or for `duration_s`; return the summary. Raises ConfigError, CannotBegin."""
-    arm, messages = Arm(config), None
+    arm = Arm(config)
     end = math.inf if duration_s is None else time.monotonic() + duration_s
     with in_file(str(config.path)), ExitStack() as stack:
         log = viewers = None
@@ -248,9 +250,8 @@ def run(
             now_ns, realtime_ns = time.monotonic_ns(), time.time_ns()
             for aligned, estimate, cycle in arm.new(now_ns):
                 if log is not None or viewers is not None:
-                    messages = messages or ArmMessages(arm.model, config.file.tool, arm.period_ns)
                     time_ns = aligned.instant_ns + realtime_ns - now_ns
-                    made, shown = messages.of(aligned, estimate, cycle, time_ns)
+                    made, shown = arm.messages.of(aligned, estimate, cycle, time_ns)
                     if log is not None:
                         log.add(made, aligned.instant_ns)
                     if viewers is not None and shown:

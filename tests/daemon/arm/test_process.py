@@ -69,3 +69,29 @@ def test_what_the_estimator_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert summary["estimated"]["elbow"] == sum(np.isfinite(each.external_nm[1]) for _, each, _ in found)
     contacts = [each.contact for _, each, _ in found]
     assert summary["contacts"] == sum(b > a for a, b in pairwise(contacts)) > 2
+
+
+def test_a_jtqd_that_comes_back_with_another_period_is_read_at_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(process, "ArmEstimator", Kept)
+    arm = process.Arm(load_arm(small_arm.write(tmp_path)))
+    joint = NOTHING._replace(
+        link_position_rad=0.5, torque_nm=10.0, sigma_nm=0.1, age_ms=5.0, status=int(VALID)
+    )
+    now, first, second = 10**12, arm._sources[0], arm._sources[1]
+    for periods_us in ((1000, 1000), (1000, None), (1000, 10_000)):
+        for source, period_us in zip((first, second), periods_us, strict=True):
+            source.about = None if period_us is None else SimpleNamespace(period_us=period_us)  # type: ignore[assignment]
+        found = []
+        for _ in range(200):
+            now += MS
+            for source, period_us in zip((first, second), periods_us, strict=True):
+                due = period_us is not None and now // MS % (period_us // 1000) == 0
+                made = [record_of(now, joint)] if due else []
+                monkeypatch.setattr(source, "read", lambda _now, made=made: made)
+            found += list(arm.new(now))
+    assert arm._estimator.period_s == pytest.approx(10e-3)
+    assert len(found) > 5
+    assert all(np.isfinite(each.position_rad).all() for each, *_ in found[-5:])
+    assert capsys.readouterr().err.count("begins anew") == 1
