@@ -91,8 +91,7 @@ class ArmModel:
             kind = model.joints[model.getJointId(joint)].shortname()
             if not kind.startswith("JointModelR"):
                 raise ConfigError(f"{name}: joint {joint}: found {kind[10:]}, expected a revolute joint")
-        norm = float(np.linalg.norm(up))
-        model.gravity.linear = -G * np.asarray(up, float) / norm
+        model.gravity.linear = -G * np.asarray(up, float) / np.linalg.norm(up)
         self.name = name
         self.pin = model
         self.joints = tuple(list(model.names)[1:])
@@ -208,10 +207,8 @@ class ArmModel:
             if not self.moves(name):
                 continue
             frame = self.pin.frames[self.pin.getFrameId(name, pin.FrameType.BODY)]
-            for shape in link.iter("collision"):
-                solid = _solid(shape, frame.placement)
-                if solid is not None:
-                    solids.append((frame.parentJoint, solid))
+            found_here = (_solid(shape, frame.placement) for shape in link.iter("collision"))
+            solids += [(frame.parentJoint, solid) for solid in found_here if solid is not None]
         for joint, solid in solids:
             points, normals = solid.points()
             free = np.ones(len(points), bool)
@@ -337,6 +334,9 @@ def _parsed(urdf: str, name: str) -> ET.Element:
         raise ConfigError(f"{name}: found no XML: {error}") from None
     if root.tag != "robot":
         raise ConfigError(f"{name}: found <{root.tag}>, expected <robot>")
+    joints, links = ({each.get("name") for each in root.findall(kind)} for kind in ("joint", "link"))
+    if joints & links:
+        raise ConfigError(f"{name}: found joint and link {(joints & links).pop()}, expected different names")
     for owner in (*root.findall("joint"), *root.findall("link")):
         _check(owner, f"{name}: {owner.tag} {owner.get('name')}")
     for joint in root.findall("joint"):

@@ -193,6 +193,7 @@ def touchable(shape: str) -> str:
         (small_arm.URDF, "hand", "found no link hand that moves"),
         (small_arm.URDF, "base", "found no link base that moves"),
         (small_arm.URDF, "universe", "found no link universe that moves"),
+        (small_arm.URDF.replace('"fore"', '"elbow"'), "flange", "found joint and link elbow"),
         (small_arm.URDF.replace('"0 -1 0"', '"0 0 0"'), "flange", "joint shoulder: found axis 0 0 0"),
         (
             small_arm.URDF.replace("2.0", "2,0", 1),
