@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="LOG=KG,X,Y,Z",
-        help="what hung at the tool in a log: mass, centre in the tool's frame [m] (default: nothing)",
+        help="what hung at the tool in a log: mass, centre in its frame [m] (default: that of ARM.yaml, else nothing)",
     )
     add("--out", type=Path, required=True, metavar="DIR", help="for arm.urdf and arm.yaml")
     add("--json", action="store_true", help="print the result as JSON")
@@ -71,9 +71,9 @@ def main(argv: list[str]) -> int:
     return 0 if result.better else 3
 
 
-def _payloads(words: Sequence[str], logs: Sequence[Path]) -> dict[Path, Hung]:
-    """Return mass [kg] and centre [m] of what hung in each log. Raises ConfigError."""
-    found: dict[Path, Hung] = dict.fromkeys(logs, (0.0, 0.0, 0.0, 0.0))
+def _payloads(words: Sequence[str], logs: Sequence[Path]) -> dict[Path, Hung | None]:
+    """Return mass [kg] and centre [m] of what hung in each log, None where nothing is said. Raises ConfigError."""
+    found: dict[Path, Hung | None] = dict.fromkeys(logs)
     for word in words:
         name, _, text = word.rpartition("=")
         try:

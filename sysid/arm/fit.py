@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -55,15 +56,19 @@ class ArmFit(NamedTuple):
 
 
 def fit_arm(
-    path: Path, payloads: Mapping[Path, tuple[float, float, float, float]]
+    path: Path, payloads: Mapping[Path, tuple[float, float, float, float] | None]
 ) -> tuple[ArmConfig, ArmModel, ArmFit]:
-    """Fit the arm of an ARM.yaml to logs. payloads: log -> mass [kg] and centre [m]. Raises OneLineError, OSError."""
+    """Fit the arm of an ARM.yaml to logs. payloads: log -> mass [kg] and centre [m], None: the file's.
+
+    Raises OneLineError, OSError.
+    """
     config = load_arm(path)
     file, urdf = config.file, str(config.urdf_path)
     model = ArmModel(config.urdf, [*file.joints], file.tool, up=file.up, name=urdf)
     groups, logs = [], dict[str, dict[str, Any]]()
-    for log, (mass, *centre) in payloads.items():
-        x, y, z = centre
+    fixed = (0.0, 0.0, 0.0, 0.0) if file.payload is None else (file.payload.mass_kg, *file.payload.centre_m)
+    for log, hung in payloads.items():
+        mass, x, y, z = hung or fixed
         groups.append(_runs(log, model, Payload(mass, (x, y, z))))
         sha256 = sha256_hex(read_file(log))
         twin = next((name for name, each in logs.items() if each["sha256"] == sha256), None)
@@ -162,7 +167,7 @@ def write(folder: Path, config: ArmConfig, model: ArmModel, result: ArmFit, comm
     ]
     text = [f"URDF {config.urdf_path.name}: SHA-256 {sha256_hex(config.urdf.encode())}", *origin]
     note = "Inertial parameters by jtq fit arm; what is fixed to a link is in that link."
-    comment = "\n".join((note, *(each.replace("--", "- -") for each in text)))
+    comment = "\n".join((note, *(re.sub("-(?=-)", "- ", each) for each in text)))
     write_whole(folder / "arm.urdf", _urdf(model, result.inertial, comment).encode())
     content: dict[str, Any] = dict(parse_yaml(config.text.encode(), str(config.path)))
     content["urdf"], content["noise"] = "arm.urdf", _noise(model, result.noise)

@@ -236,3 +236,20 @@ def test_files_of_the_arm_are_not_written_over(
     assert main(["fit", "arm", str(arm), str(empty), "--out", str(arm.parent)]) == 1
     assert f"found {arm} there" in capsys.readouterr().err
     assert arm.read_bytes() == before
+
+
+def test_what_always_hangs_at_the_tool_is_not_a_part_of_the_arm(
+    logs: tuple[Path, list[Path]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arm, (_, heavy, _) = logs
+    content = yaml.safe_load(arm.read_text())
+    content["payload"] = {"mass_kg": HEAVY.mass_kg, "centre_m": [*HEAVY.centre_m]}
+    with_payload = arm.parent / "payload---.yaml"
+    with_payload.write_text(yaml.safe_dump(content))
+    hung = f"{heavy}=2.0,0.01,-0.02,0.06"
+    masses = []
+    for words in ([with_payload, heavy], [arm, heavy, "--payload", hung]):
+        assert main(["fit", "arm", *map(str, words), "--out", str(tmp_path)]) == 0
+        config = load_arm(tmp_path / "arm.yaml")
+        masses.append(ArmModel(config.urdf, JOINTS, TOOL).inertial()[:, 0])
+    assert masses[0] == pytest.approx(masses[1], rel=1e-6)
