@@ -26,12 +26,7 @@ def parser() -> argparse.ArgumentParser:
     text = "Estimate what pushes on an arm from outside, from the joint torques of the running jtqd."
     result = command_parser("jtqd-arm", text, _EXAMPLES)
     add = result.add_argument
-    add(
-        "arm",
-        type=Path,
-        metavar="ARM.yaml",
-        help="URDF, and which joint of which jtqd is which of its joints",
-    )
+    add("arm", type=Path, metavar="ARM.yaml", help="URDF, and which jtqd has which of its joints")
     add("--record", type=Path, metavar="DIR", help="directory of MCAP logs (default: no log)")
     add("--duration", type=seconds, metavar="S", help="end after S seconds (default: run until stopped)")
     text = "serve Foxglove and Lichtblick (default: ws://127.0.0.1:8765; extra: live)"

@@ -9,7 +9,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -46,7 +46,8 @@ _REPEAT_EVERY: Final = 60
 
 def warn(text: str) -> None:
     """Print a line for the operator."""
-    print(f"jtqd-arm: {text}", file=sys.stderr, flush=True)
+    with suppress(OSError):  # who read it has gone, or its disk is full
+        print(f"jtqd-arm: {text}", file=sys.stderr, flush=True)
 
 
 class ArmLog:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -263,3 +263,17 @@ def test_nobody_is_waited_for_longer_than_the_run(tmp_path: Path, capsys: pytest
         "no jtqd runs on none_vcan1",
     ]
     assert said.err.count("waiting: no jtqd runs") == 2
+
+
+def test_it_goes_on_where_nobody_reads_what_it_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    joints = {"shoulder": {"bus": "none", "joint": 1, "direction": 1, "zero_rad": 0.0}}
+    path = small_arm.write(tmp_path, small_arm.content(joints=joints))
+    with open("/dev/full", "w", encoding="utf-8", buffering=1) as full:
+        monkeypatch.setattr(sys, "stderr", full)
+        assert main([str(path), "--duration", "0.1", "--json"]) == 0
+        monkeypatch.undo()
+        with suppress(OSError):
+            full.close()
+    assert json.loads(capsys.readouterr().out)["cycles"] == 0
