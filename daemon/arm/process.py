@@ -33,8 +33,8 @@ from jtqd.daemon.recording.parts import Parts
 from jtqd.daemon.recording.recorder import RecorderRequest
 from jtqd.daemon.recording.run_files import Account, free_run
 from jtqd.daemon.shared.processes import CannotBegin, Stop
-from jtqd.estimator.decoder import in_file
-from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.decoder import FieldError, in_file
+from jtqd.estimator.errors import ConfigError, Verbatim
 from jtqd.estimator.status import NAMES
 from jtqd.estimator.text import finite, number, table_lines
 
@@ -203,9 +203,13 @@ class Arm:
             if source.why != self._why[n]:
                 self._why[n] = source.why
                 warn(f"waiting: {source.why}" if source.why else f"reading jtqd on {source.bus}")
-        found = [1000 * each.about.period_us for each in self._sources if each.about is not None]
-        if len(found) == len(self._sources) and found != self._periods_ns:
-            self._begin(found)
+        found = {each.bus: each.about for each in self._sources if each.about is not None}
+        periods_ns = [1000 * each.period_us for each in found.values()]
+        if len(found) == len(self._sources) and periods_ns != self._periods_ns:
+            if len({each.instance for each in found.values()}) < len(found):
+                same = Verbatim(f"one jtqd behind several of {', '.join(found)}")
+                raise FieldError("arm", "joints", same, "one name of each bus")
+            self._begin(periods_ns)
         if not self._buses:
             return
         for bus, new in zip(self._buses, records, strict=True):

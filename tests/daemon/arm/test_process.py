@@ -12,6 +12,7 @@ import pytest
 
 from jtqd.daemon.arm import process
 from jtqd.daemon.arm.arm_file import load_arm
+from jtqd.estimator.decoder import FieldError
 from jtqd.estimator.status import VALID
 from tests.daemon.arm import small_arm
 from tests.daemon.arm.small_arm import NOTHING, record_of
@@ -45,7 +46,7 @@ def test_what_the_estimator_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyP
     )
     now = 10**12
     for source, period_us in zip(arm._sources, (1000, 2000), strict=True):
-        source.about = SimpleNamespace(period_us=period_us)  # type: ignore[assignment]
+        source.about = SimpleNamespace(period_us=period_us, instance=source.bus)  # type: ignore[assignment]
     found = []
     for k in range(4 * EVERY):
         for source in arm._sources:
@@ -82,7 +83,9 @@ def test_a_jtqd_that_comes_back_with_another_period_is_read_at_it(
     now, first, second = 10**12, arm._sources[0], arm._sources[1]
     for periods_us in ((1000, 1000), (1000, None), (1000, 10_000)):
         for source, period_us in zip((first, second), periods_us, strict=True):
-            source.about = None if period_us is None else SimpleNamespace(period_us=period_us)  # type: ignore[assignment]
+            source.about = (
+                None if period_us is None else SimpleNamespace(period_us=period_us, instance=source.bus)
+            )  # type: ignore[assignment]
         found = []
         for _ in range(200):
             now += MS
@@ -95,3 +98,14 @@ def test_a_jtqd_that_comes_back_with_another_period_is_read_at_it(
     assert len(found) > 5
     assert all(np.isfinite(each.position_rad).all() for each, *_ in found[-5:])
     assert capsys.readouterr().err.count("begins anew") == 1
+
+
+def test_a_jtqd_under_two_names_is_refused(tmp_path: Path) -> None:
+    arm = process.Arm(load_arm(small_arm.write(tmp_path)))
+    for source in arm._sources:
+        source.about = SimpleNamespace(period_us=1000, instance="vcan0")  # type: ignore[assignment]
+        source._due_ns = 2 * 10**12
+    with pytest.raises(FieldError) as error:
+        list(arm.new(10**12))
+    assert error.value.key == "joints"
+    assert "one jtqd behind several of vcan0, vcan1" in str(error.value)
