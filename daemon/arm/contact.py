@@ -25,7 +25,7 @@ BEGINS, LASTS = 5.0, 2.0
 """Standard normal quantiles at which a contact begins, and below which it ends."""
 ENDED_S: Final = 0.03
 LONG_S: Final = 1.0
-"""After this time a change is compared with what free motion changes in any time."""
+"""After this time zero tells more of what is there without contact than what was there before."""
 SIDEWAYS: Final = 0.25
 """Of a force: standard deviation along the surface, as a share of that into it (friction)."""
 STRONG_N: Final = 40.0
@@ -153,12 +153,11 @@ class Detector:
         if not freedom:  # it goes on when something is known again, or ends
             return False
         weights = self.certain[1] * weight
-        level = _beyond_by(self.smooth[1], weights, belief[2])
-        much = level > self.limits[freedom]
-        if not much and (self.sudden or level > quantile(freedom, LASTS)):
-            if self.cycle - self.since > self.long:
-                weights = 0.5 * self.certain[2] * weight
-            much = _beyond_by(self.change(), weights, belief[1]) > quantile(freedom, LASTS)
+        level, least = _beyond_by(self.smooth[1], weights, belief[2]), quantile(freedom, LASTS)
+        much = level > (self.limits[freedom] if self.sudden else least)
+        if not much and self.sudden:
+            much = _beyond_by(self.change(), weights, belief[1]) > least
+            self.sudden = self.cycle - self.since < self.long
         self.below = 0 if much else self.below + 1
         if self.below > self.ending:
             self.end()
