@@ -119,8 +119,8 @@ class ArmEstimator:
         self.cycle += 1
         model = self.model
         before, self.position = self.position, position_rad
-        farthest = FASTEST_RAD_S * self.period_s
-        if not math.isfinite(position_rad.sum()) or (np.abs(position_rad - before) > farthest).any():
+        way = float(np.abs(position_rad - before).max())  # NaN after a gap, and in one
+        if way > FASTEST_RAD_S * self.period_s or (way != way and not math.isfinite(position_rad.sum())):  # noqa: PLR0124
             self.filtered = Filtered(model.n, self.period_s)
             self.detector.forget()
             return self._nothing()
@@ -163,7 +163,7 @@ class ArmEstimator:
             belief.sigma_kg,
             self.centre,
             found.link,
-            float(np.linalg.norm(found.force_n)),
+            math.hypot(*found.force_n),
             self.detector.since,
             found.point_m,
             found.point_sigma_m,
