@@ -334,3 +334,42 @@ def test_without_any_torque_no_contact_is_told() -> None:
     assert contact[700:800].all()
     assert not contact[800:1000].any()
     assert contact[1100:].all()
+
+
+def test_what_was_learned_just_before_a_contact_is_taken_back() -> None:
+    push = Push(
+        7, (0.0, 0.0, 0.1), (0.0, 0.0, -12.0), 3000, 5000, rise=1900
+    )  # it leans: like a payload that grows
+    motion = moved(5000, push=push)
+    estimator = ArmEstimator(new_model(), PERIOD_S, NOISE)
+    made = [estimator.step(q, x, SIGMA) for q, x in zip(motion.position_rad, motion.torque_nm, strict=True)]
+    contact = stacked(made, "contact") > 0
+    first = int(np.argmax(contact))
+    assert 3000 < first < 4600
+    before, after = made[first - 60], made[first + 120]
+    assert abs(after.payload_kg - made[2900].payload_kg) < 0.6 * abs(
+        before.payload_kg - made[2900].payload_kg
+    )
+
+
+def test_at_rest_nothing_is_learned() -> None:
+    estimator = ArmEstimator(new_model(), PERIOD_S, NOISE)
+    motion = moved(1500, payload=TruePayload(1.0, (0.0, 0.0, 0.05)), still=True)
+    positions = motion.position_rad + 1e-6 * RNG(6).normal(size=motion.position_rad.shape)
+    made = [estimator.step(q, x, SIGMA) for q, x in zip(positions, motion.torque_nm, strict=True)]
+    assert made[-1].payload_sigma_kg == made[0].payload_sigma_kg
+    assert made[-1].payload_kg == 0.0
+
+
+def test_residuals_of_before_follow_what_is_learned() -> None:
+    motion = moved(1200, payload=TruePayload(2.0, (0.02, -0.03, 0.07)), seed=11)
+    estimator = ArmEstimator(new_model(), PERIOD_S, NOISE)
+    last, off, learned = np.full(7, np.nan), [], []
+    for q, x in zip(motion.position_rad, motion.torque_nm, strict=True):
+        before = estimator.belief.hung
+        made = estimator.step(q, x, SIGMA)
+        off.append(np.abs(made.external_nm - last).max())
+        learned.append(np.abs(estimator.belief.hung - before).max())
+        last = estimator.detector.smooth[0].copy()
+    assert np.nanmax(learned) > 0.5  # kg at once
+    assert np.nanmax(off[70:]) < 0.3
