@@ -25,7 +25,7 @@ SPAN_S, EXPLAINED = 5.0, 1.5
 """A payload has come where motion of this length leaves at most so many times its variance."""
 
 
-class Told(NamedTuple):
+class Observation(NamedTuple):
     """One cycle: when [s], residual [n] of the arm without payload, H [n, 4 + n], variances [n]."""
 
     time_s: float
@@ -42,7 +42,7 @@ class Belief:
         self.mean, self.covariance = np.zeros(4 + n), np.zeros((4 + n, 4 + n))
         self.day = np.zeros(n)
         self.past: deque[tuple[float, Array, Array]] = deque()
-        self.pushed: deque[Told] = deque(maxlen=round(2.0 * SPAN_S / LEARNS_S))
+        self.in_contact: deque[Observation] = deque(maxlen=round(2.0 * SPAN_S / LEARNS_S))
         self.forget_payload()
 
     def begin(self, variance: Array) -> None:
@@ -63,7 +63,7 @@ class Belief:
         else:
             self.mean[:4] = self.known.mass_kg, *(self.known.mass_kg * np.array(self.known.centre_m))
         self.past.clear()
-        self.pushed.clear()
+        self.in_contact.clear()
         self._hang()
 
     def _hang(self) -> None:
@@ -74,18 +74,18 @@ class Belief:
         """x as it acts: of masses that can be."""
         self.sigma_kg = float(np.sqrt(self.covariance[0, 0]))
 
-    def learn(self, told: Told) -> None:
+    def learn(self, seen: Observation) -> None:
         """Learn one cycle of motion without contact."""
-        self.pushed.clear()
-        self.past.append((told.time_s, self.mean, self.covariance))
-        while len(self.past) > 1 and self.past[1][0] <= told.time_s - BACK_S:
+        self.in_contact.clear()
+        self.past.append((seen.time_s, self.mean, self.covariance))
+        while len(self.past) > 1 and self.past[1][0] <= seen.time_s - BACK_S:
             self.past.popleft()
         offsets = np.diag(np.concatenate((np.zeros(4), self.day * (LEARNS_S / DRIFT_S))))
         self.covariance = self.covariance + offsets
-        self._update(told)
+        self._update(seen)
         self._hang()
 
-    def is_payload(self, told: Told) -> bool:
+    def is_payload(self, seen: Observation) -> bool:
         """Take one cycle of motion under contact; return whether another payload, now believed, explains the contact."""
         if self.past:
             _, self.mean, self.covariance = self.past[0]
@@ -93,30 +93,30 @@ class Belief:
             self._hang()
         if self.known is not None:
             return False
-        self.pushed.append(told)
-        if len(self.pushed) * LEARNS_S < SPAN_S or len(self.pushed) % round(1.0 / LEARNS_S):
+        self.in_contact.append(seen)
+        if len(self.in_contact) * LEARNS_S < SPAN_S or len(self.in_contact) % round(1.0 / LEARNS_S):
             return False
         return self._explained()
 
     def _explained(self) -> bool:
         other = Belief(self.n, None)
         other.mean[4:], other.covariance[4:, 4:] = self.mean[4:], self.covariance[4:, 4:]
-        for each in self.pushed:
+        for each in self.in_contact:
             other._update(each)
-        left = [(each.bare - each.columns @ other.mean) ** 2 / each.variance for each in self.pushed]
+        left = [(each.bare - each.columns @ other.mean) ** 2 / each.variance for each in self.in_contact]
         if not np.nanmean(left) < EXPLAINED:
             return False
         self.mean, self.covariance = other.mean, other.covariance
-        self.pushed.clear()
+        self.in_contact.clear()
         self._hang()
         return True
 
-    def _update(self, told: Told) -> None:
-        """Take one cycle by Kalman's equations; joints without a torque tell nothing."""
-        there = np.isfinite(told.bare * told.variance)
-        h = told.columns[there]
-        spread = h @ self.covariance @ h.T + np.diag(told.variance[there] * (LASTING_S / LEARNS_S))
+    def _update(self, seen: Observation) -> None:
+        """Take one cycle by Kalman's equations; joints without a torque have no part."""
+        there = np.isfinite(seen.bare * seen.variance)
+        h = seen.columns[there]
+        spread = h @ self.covariance @ h.T + np.diag(seen.variance[there] * (LASTING_S / LEARNS_S))
         gain = np.linalg.solve(spread, h @ self.covariance).T
-        self.mean = self.mean + gain @ (told.bare[there] - h @ self.mean)
+        self.mean = self.mean + gain @ (seen.bare[there] - h @ self.mean)
         covariance = self.covariance - gain @ h @ self.covariance
         self.covariance = 0.5 * (covariance + covariance.T)

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from jtqd.daemon.arm.belief import LEARNS_S, Belief, Told
+from jtqd.daemon.arm.belief import LEARNS_S, Belief, Observation
 from jtqd.daemon.arm.contact import FAST_S, SLOW_S, Detector, Place, motion_gains, place
 from jtqd.daemon.arm.filtering import Filtered
 from jtqd.daemon.arm.model import ArmModel, Array, Payload
@@ -85,19 +85,18 @@ class ArmEstimator:
         )
         self.conditioning = math.inf
         self.to_wrench, self.wrench_sigma = np.full((6, model.n), np.nan), np.full(6, np.nan)
-        self.cycle = -1
-        n = model.n
+        self.cycle, n = -1, model.n
         self.position = np.full(n, np.nan)
         self.filtered = Filtered(n, period_s)
         self.motion = motion_gains(period_s)[:, None, None]
         self.shaken = np.zeros(n)
         self.detector = Detector(n, period_s, self.noise.tests)
         self.found: Place | None = None
-        self.belief = Belief(model.n, payload)
+        self.belief = Belief(n, payload)
         self.forget_payload()
 
     def forget_payload(self) -> None:
-        """Learn the payload anew: a gripper has taken or left something."""
+        """Learn the payload from the beginning: a gripper has taken or left something."""
         n = self.model.n
         self.belief.forget_payload()
         self.columns = np.concatenate((np.zeros((n, 4)), np.eye(n)), axis=1)
@@ -171,8 +170,8 @@ class ArmEstimator:
 
     def _believe(self, payload: Array, inertia: Array) -> None:
         """Compute what beliefs and noise of positions add to residuals and to their changes; payload [n, 4]: its columns."""
-        shaken = inertia * self.noise.position_rad
-        shaken = self.motion * (shaken @ shaken.T)
+        root = inertia * self.noise.position_rad
+        shaken = self.motion * (root @ root.T)
         self.shaken = np.diag(shaken[0])
         self.columns[:, :4] = payload
         self.before.append(payload)
@@ -191,8 +190,7 @@ class ArmEstimator:
         found = place(self.model, np.where(there, change, 0.0), np.where(there, spread, 1e12))
         if found is None:  # no shapes: the last joint that feels it
             felt = np.abs(change) > 3.0 * np.sqrt(np.where(there, spread, np.inf))
-            link = int(np.max(np.flatnonzero(felt), initial=0)) + 1
-            found = Place(link, np.full(3, np.nan), np.nan, np.full(3, np.nan))
+            found = NOWHERE._replace(link=int(np.max(np.flatnonzero(felt), initial=0)) + 1)
         return found
 
     def _solve_wrench(self, residual: Array, spread: Array) -> Array:
@@ -214,15 +212,18 @@ class ArmEstimator:
     _scales: Final = np.outer(*[np.array([1.0, 1.0, 1.0, SCALE_M, SCALE_M, SCALE_M])] * 2)
 
     def _learn(self, raw: Array, v: Array, variance: Array, contact: bool) -> bool:
-        """Tell a cycle of motion to the belief, and take what it has learned; return whether there still is contact."""
+        """Give a cycle of motion to the belief, and take what it has learned; return whether there still is contact."""
         belief, detector = self.belief, self.detector
         if np.abs(v).max() <= MOVES_RAD_S:
             return contact
         bare = raw + self.columns[:, :4] @ belief.hung[:4]
-        told, before = Told(self.cycle * self.period_s, bare, self.columns.copy(), variance), belief.hung
+        seen, before = (
+            Observation(self.cycle * self.period_s, bare, self.columns.copy(), variance),
+            belief.hung,
+        )
         if not contact:
-            belief.learn(told)
-        elif belief.is_payload(told):
+            belief.learn(seen)
+        elif belief.is_payload(seen):
             detector.end()
             contact = False
         if belief.hung is not before:

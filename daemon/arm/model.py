@@ -1,7 +1,7 @@
 """The rigid bodies of an arm: pinocchio's model of a URDF, a payload at the tool, the surfaces that can be pushed.
 
 Torques are on the link side of the joints, positive along the joint's angle; angles, speeds and accelerations are arrays [n]
-of the n joints in the order of the URDF's tree. Vectors are in base axes where nothing else is said.
+of the n joints in the order of the URDF's tree. Vectors are in base axes unless stated otherwise.
 """
 
 from __future__ import annotations

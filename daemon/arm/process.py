@@ -176,7 +176,7 @@ class Arm:
         """Build what depends on the periods of the buses [ns]."""
         noise, names = self._file.noise, self.model.joints
         if self._buses:
-            warn(f"period {self._periods_ns} ns is {periods_ns} ns now: begins anew")
+            warn(f"period {self._periods_ns} ns is {periods_ns} ns now: begins again")
         self._periods_ns, period_ns = periods_ns, max(periods_ns)
         self.messages = ArmMessages(self.model, self._file.tool, period_ns)
         self._buses = [

@@ -72,7 +72,7 @@ def main(argv: list[str]) -> int:
 
 
 def _payloads(words: Sequence[str], logs: Sequence[Path]) -> dict[Path, Hung | None]:
-    """Return mass [kg] and centre [m] of what hung in each log, None where nothing is said. Raises ConfigError."""
+    """Return mass [kg] and centre [m] of what hung in each log, None where none is given. Raises ConfigError."""
     found: dict[Path, Hung | None] = dict.fromkeys(logs)
     for word in words:
         name, _, text = word.rpartition("=")

@@ -22,7 +22,7 @@ from jtqd.estimator.files import read_file, write_whole
 from jtqd.estimator.text import counted, number, percent, sha256_hex, table_lines
 from jtqd.models.files import parse_yaml
 from jtqd.sysid.arm.identification import (
-    TOLD,
+    DETERMINED,
     FreeMotion,
     Normal,
     identify,
@@ -32,7 +32,7 @@ from jtqd.sysid.arm.identification import (
 
 _TOPIC: Final = "/arm/external"
 _SHORTEST_S: Final = 5.0
-"""Of a run without a gap: in a shorter one an offset and a slow error are not told from anything."""
+"""Of a run without a gap: in a shorter one an offset and a slow error look like anything."""
 _LEAST_RAD: Final = 0.1
 """Travel of the joint that moves most: noise at standstill is not that of motion."""
 _PARTS: Final = ("mass", *["centre"] * 3, *["inertia"] * 6)
@@ -87,8 +87,10 @@ def fit_arm(
     model.set_inertial(found.inertial)
     noise = noise_of(model, [run for runs in groups for run in runs])
     from_cad = {
-        joint: list(dict.fromkeys(name for name, share in zip(_PARTS, row, strict=True) if share > TOLD))
-        for joint, row in zip(model.joints, found.untold, strict=True)
+        joint: list(
+            dict.fromkeys(name for name, share in zip(_PARTS, row, strict=True) if share > DETERMINED)
+        )
+        for joint, row in zip(model.joints, found.relative, strict=True)
     }
     return config, model, ArmFit(found.inertial, noise, held_out, better, from_cad, logs)
 
@@ -126,7 +128,7 @@ def _runs(path: Path, model: ArmModel, payload: Payload) -> list[FreeMotion]:
 
 
 def _held_out(model: ArmModel, normals: Sequence[Sequence[Normal]]) -> tuple[Array, Array]:
-    """Return the rms [n] in Nm before and after, each log judged by what the others told."""
+    """Return the rms [n] in Nm before and after, each log judged by a fit to the others."""
     before, after = [], []
     for k, own in enumerate(normals):
         rest = identify(model, [each for j, some in enumerate(normals) if j != k for each in some])

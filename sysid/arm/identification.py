@@ -24,7 +24,7 @@ SHAPE: Final = 0.2
 DEVIATION: Final = np.array([MASS, *[CENTRE_M] * 3, *[SHAPE] * 6])
 EVERY_S: Final = 0.02
 SKIPPED_S: Final = 0.1
-TOLD: Final = 0.7
+DETERMINED: Final = 0.7
 """A value is from the motion where its standard deviation is below this share of the prior's."""
 STEPS: Final = 20
 LEARNED_S: Final = 10.0
@@ -66,10 +66,10 @@ class Normal(NamedTuple):
 
 
 class Identified(NamedTuple):
-    """Inertial parameters [n, 10]; standard deviations of x as shares of the prior's [n, 10] (see TOLD)."""
+    """Inertial parameters [n, 10]; standard deviations of x as shares of the prior's [n, 10] (see DETERMINED)."""
 
     inertial: Array
-    untold: Array
+    relative: Array
 
 
 class Body:

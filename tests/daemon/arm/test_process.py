@@ -97,7 +97,7 @@ def test_a_jtqd_that_comes_back_with_another_period_is_read_at_it(
     assert arm._estimator.period_s == pytest.approx(10e-3)
     assert len(found) > 5
     assert all(np.isfinite(each.position_rad).all() for each, *_ in found[-5:])
-    assert capsys.readouterr().err.count("begins anew") == 1
+    assert capsys.readouterr().err.count("begins again") == 1
 
 
 def test_a_jtqd_under_two_names_is_refused(tmp_path: Path) -> None:

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.arm.model import Payload
-from jtqd.sysid.arm.identification import CENTRE_M, TOLD, Body, FreeMotion, identify, noise_of, normal_of
+from jtqd.sysid.arm.identification import (
+    CENTRE_M,
+    DETERMINED,
+    Body,
+    FreeMotion,
+    identify,
+    noise_of,
+    normal_of,
+)
 from tests.daemon.arm.panda import PERIOD_S, moved, new_model
 from validation.arm.arm import Payload as TruePayload
 from validation.arm.arm import links
@@ -68,10 +76,10 @@ def test_what_motion_cannot_tell_stays_at_its_cad_value() -> None:
     model = new_model()
     found = identify(model, [normal_of(model, each) for each in runs()])
     cad = model.inertial()
-    assert found.untold[0, 0] > 0.99  # the first link turns about a vertical axis: its mass moves nothing
+    assert found.relative[0, 0] > 0.99  # the first link turns about a vertical axis: its mass moves nothing
     assert found.inertial[0, 0] == pytest.approx(cad[0, 0], rel=3e-3)
-    assert (found.untold < TOLD).any()
-    assert (found.untold <= 1.0 + 1e-9).all()
+    assert (found.relative < DETERMINED).any()
+    assert (found.relative <= 1.0 + 1e-9).all()
 
 
 def test_every_result_is_a_body_that_can_exist() -> None:
